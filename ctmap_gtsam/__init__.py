@@ -1,0 +1,1 @@
+"""CT-Map on GTSAM."""

@@ -1,0 +1,1 @@
+"""Depth renderers behind one protocol."""
