@@ -1,0 +1,1 @@
+"""What filter and smoother share: keyframes, surfaces, tracks, scoring on depth, proposals."""

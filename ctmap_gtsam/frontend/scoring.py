@@ -1,0 +1,237 @@
+"""Hypotheses against a depth image: the fused kernel that renders and scores, and the local refinement.
+
+Both work on a `Tile`, a part of the depth image sampled at a fixed angular step, so that the number of samples on an
+object depends on how large it appears and not on the camera's resolution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.measurement import pixel_log_ratio
+from sequences.camera import Camera
+from sequences.catalogue import Mesh
+from sequences.rendering.rasteriser import intrinsics, project, rasterise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Part of one depth image, every step-th pixel."""
+
+    camera: Camera
+    """the window's own camera"""
+    depth: NDArray[np.float32]
+    """(h, w) metres, 0 = no measurement"""
+    background: NDArray[np.float32]
+    """(h, w) metres: the depth of the surface behind, 0 where none is known"""
+    x: int
+    """left column of the window in the image"""
+    y: int
+    """top row of the window in the image"""
+    step: int
+    """pixels between samples"""
+
+
+def cut_tile(
+    camera: Camera, depth: NDArray[np.float32], background: NDArray[np.float32], box: Array, step: int
+) -> Tile:
+    """The part of a depth image (h, w) within a box (x0, y0, x1, y1), clipped to the image, at least one sample."""
+    x0, y0 = (int(np.clip(np.floor(box[i]), 0, size - 1)) for i, size in ((0, camera.width), (1, camera.height)))
+    x1 = int(np.clip(np.ceil(box[2]), x0 + 1, camera.width))
+    y1 = int(np.clip(np.ceil(box[3]), y0 + 1, camera.height))
+    part = (slice(y0, y1, step), slice(x0, x1, step))
+    cut = np.ascontiguousarray(depth[part])
+    window = camera.window(x0, y0, cut.shape[1], cut.shape[0], step)
+    return Tile(window, cut, np.ascontiguousarray(background[part]), x0, y0, step)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What the fused kernel says of K hypotheses."""
+
+    log_ratio: Array
+    """(K,) sum over pixels of log p(z | object) / p(z | background), not yet tempered"""
+    covered: Array
+    """(K,) samples that the object covers"""
+    visible: Array
+    """(K,) of those, samples with a measurement that is not in front of the object"""
+    box: Array
+    """(K, 4) enclosing box (x0, y0, x1, y1) of the visible samples in image pixels; NaN where there are none"""
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _score(vertices, faces, poses, camera, depth, background, parameters, margin, out):
+    height, width = depth.shape
+    no_ids = np.empty((0, 0), np.int32)
+    for k in numba.prange(poses.shape[0]):
+        projected = np.empty((vertices.shape[0], 3))
+        inverse_depth = np.zeros((height, width))
+        project(vertices, poses[k], camera[0], camera[1], camera[2], camera[3], projected)
+        rasterise(projected, faces, inverse_depth, no_ids)
+        total = 0.0
+        covered, visible = 0, 0
+        u0, v0, u1, v1 = width, height, -1, -1
+        for v in range(height):
+            for u in range(width):
+                w = inverse_depth[v, u]
+                if w == 0.0:
+                    continue
+                covered += 1
+                z = depth[v, u]
+                if z == 0.0:
+                    continue
+                rendered = 1.0 / w
+                total += pixel_log_ratio(z, rendered, background[v, u], parameters)
+                if z > rendered - margin:
+                    visible += 1
+                    u0, u1 = min(u0, u), max(u1, u)
+                    v0, v1 = min(v0, v), max(v1, v)
+        out[k, 0], out[k, 1], out[k, 2] = total, covered, visible
+        out[k, 3], out[k, 4], out[k, 5], out[k, 6] = u0, v0, u1, v1
+
+
+def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Array, margin_m: float) -> Scores:
+    """Render hypotheses (K, 4, 4) of one class into a tile and sum the pixels' log-likelihood ratios.
+
+    Args:
+        mesh: the class's mesh (coarse is enough).
+        tile: where to look.
+        T_camera_object: (K, 4, 4) metres.
+        parameters: of `factors.measurement.DepthModel`.
+        margin_m: a measurement so far in front of the object is an occluder.
+    """
+    poses = np.ascontiguousarray(T_camera_object, dtype=np.float64)
+    out = np.empty((len(poses), 7))
+    camera = intrinsics(tile.camera)
+    _score(mesh.vertices, mesh.faces, poses, camera, tile.depth, tile.background, parameters, margin_m, out)
+    # samples stand for step x step pixels
+    half = tile.step / 2.0
+    box = out[:, 3:] * tile.step + np.array([tile.x, tile.y, tile.x, tile.y]) + np.array([-half, -half, half, half])
+    box[out[:, 2] == 0] = np.nan
+    return Scores(out[:, 0], out[:, 1], out[:, 2], box)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(projected, faces, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
+    """Point-to-plane normal equations of one pose in its own right tangent; returns the sum of weights."""
+    inverse_depth[:] = 0.0
+    rasterise(projected, faces, inverse_depth, ids)
+    H[:] = 0.0
+    g[:] = 0.0
+    total = 0.0
+    J = np.empty(6)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            w = inverse_depth[v, u]
+            z = depth[v, u]
+            if w == 0.0 or z == 0.0:
+                continue
+            gap = z - 1.0 / w
+            if abs(gap) > 10.0 * width_m:
+                continue
+            n = normals[ids[v, u]]
+            rx, ry = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]
+            # the observed point in the object frame
+            dx, dy, dz = rx * z - T[0, 3], ry * z - T[1, 3], z - T[2, 3]
+            px = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
+            py = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
+            pz = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+            # the ray's direction in the object frame times n: distance to the plane from the gap along the ray
+            along = (
+                n[0] * (T[0, 0] * rx + T[1, 0] * ry + T[2, 0])
+                + n[1] * (T[0, 1] * rx + T[1, 1] * ry + T[2, 1])
+                + n[2] * (T[0, 2] * rx + T[1, 2] * ry + T[2, 2])
+            )
+            r = along * gap
+            weight = 1.0 / (1.0 + (r / width_m) ** 2) ** 2
+            J[0], J[1], J[2] = py * n[2] - pz * n[1], pz * n[0] - px * n[2], px * n[1] - py * n[0]
+            J[3], J[4], J[5] = n[0], n[1], n[2]
+            total += weight
+            for i in range(6):
+                g[i] += weight * J[i] * r
+                for j in range(i + 1):
+                    H[i, j] += weight * J[i] * J[j]
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _move(T, xi):
+    """T exp(xi) in place, for the small steps of the refinement."""
+    angle = np.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)
+    a = 1.0 - angle**2 / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    b = 0.5 - angle**2 / 24.0 if angle < 1e-4 else (1.0 - np.cos(angle)) / angle**2
+    c = 1.0 / 6.0 if angle < 1e-4 else (angle - np.sin(angle)) / angle**3
+    W = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [-xi[1], xi[0], 0.0]])
+    W2 = W @ W
+    E = np.eye(4)
+    E[:3, :3] += a * W + b * W2
+    E[:3, 3] = (np.eye(3) + b * W + c * W2) @ xi[3:]
+    T[:] = T @ E
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _refine(vertices, faces, normals, poses, camera, depth, widths):
+    for k in numba.prange(poses.shape[0]):
+        projected = np.empty((vertices.shape[0], 3))
+        inverse_depth = np.empty(depth.shape)
+        ids = np.zeros(depth.shape, np.int32)
+        H, g = np.empty((6, 6)), np.empty(6)
+        T = poses[k].copy()
+        for step in range(widths.shape[0]):
+            project(vertices, T, camera[0], camera[1], camera[2], camera[3], projected)
+            total = _normal_equations(
+                projected, faces, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
+            )
+            if total < 6.0:
+                break
+            for i in range(6):
+                # a direction that the surface doesn't hold must not run away: a weak prior of 10 cm and 1 rad
+                H[i, i] += 1e-3 * H[i, i] + (1e-4 if i < 3 else 1e-2) * total * 1e-2
+            xi = np.linalg.solve(H, g)
+            length = np.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)
+            shift = np.sqrt(xi[3] ** 2 + xi[4] ** 2 + xi[5] ** 2)
+            # the linearisation holds for some 15 degrees and some centimetres
+            xi *= min(1.0, 0.3 / max(length, 1e-12), 0.03 / max(shift, 1e-12))
+            _move(T, xi)
+            if length < 1e-5 and shift < 1e-6:
+                break
+        poses[k] = T
+
+
+def refine_on_depth(mesh: Mesh, normals: Array, tile: Tile, T_camera_object: Array, widths_m: Array) -> Array:
+    """Projective point-to-plane registration of hypotheses (K, 4, 4) to a tile's depth (Chen and Medioni, 1991).
+
+    The observed points of the pixels that the object covers are drawn to the faces rendered there, with Geman-McClure
+    weights whose width falls from step to step (graduated non-convexity).
+
+    Args:
+        mesh: the class's mesh.
+        normals: (F, 3) unit normals of its faces, object frame.
+        tile: where to look.
+        T_camera_object: (K, 4, 4) starts.
+        widths_m: (steps,) the robust width at each step, metres.
+
+    Returns:
+        (K, 4, 4) refined poses. Not all are better than their start: score them.
+    """
+    poses = np.array(T_camera_object, dtype=np.float64, order="C")
+    camera = intrinsics(tile.camera)
+    _refine(mesh.vertices, mesh.faces, normals, poses, camera, tile.depth, np.asarray(widths_m, dtype=np.float64))
+    return poses
+
+
+def face_normals(mesh: Mesh) -> Array:
+    """(F, 3) unit normals, object frame; zero for degenerate faces."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    n = np.cross(b - a, c - a)
+    length = np.linalg.norm(n, axis=-1, keepdims=True)
+    return n / np.where(length == 0, 1.0, length)

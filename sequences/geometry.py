@@ -1,0 +1,172 @@
+"""Surfaces that nobody modelled: the planes of a depth image, and which way is up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sequences import se3
+from sequences.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlaneSearch:
+    """How planes are looked for; the numbers are those of `find_planes`."""
+
+    samples_across: int = 96
+    candidates: int = 150
+    tolerance_per_m: float = 0.012
+    normal_tolerance_rad: float = 0.35
+    min_share: float = 0.04
+    max_planes: int = 4
+    margin_m: float = 0.02
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A bounded piece of the plane n . p = offset."""
+
+    normal: Array
+    """(3,) unit, towards the camera that saw it"""
+    offset: float
+    """metres along the normal"""
+    T_frame_plane: Array
+    """(4, 4) z along the normal, origin at the mean of its points"""
+    hull: Array
+    """(H, 2) convex outline in the plane's x and y, metres, margin included"""
+    share: float
+    """of the image's measured samples that lie on it"""
+
+    @property
+    def area(self) -> float:
+        """Of the outline, square metres."""
+        return float(cv2.contourArea(self.hull.astype(np.float32)))
+
+    def moved(self, T: Array) -> Plane:
+        """The same plane in another frame, T_other_frame (4, 4)."""
+        normal = T[:3, :3] @ self.normal
+        pose = T @ self.T_frame_plane
+        return Plane(normal, float(normal @ pose[:3, 3]), pose, self.hull, self.share)
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Whether the feet of points (..., 3) lie within the outline."""
+        local = se3.transform(se3.inverse(self.T_frame_plane), points)[..., :2]
+        following = np.roll(self.hull, -1, axis=0)
+        edge, offset = following - self.hull, local[..., None, :] - self.hull
+        side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
+        return np.asarray((side >= 0).all(-1) | (side <= 0).all(-1))
+
+
+def find_planes(
+    camera: Camera, depth: NDArray[np.float32], rng: np.random.Generator, search: PlaneSearch | None = None
+) -> tuple[Plane, ...]:
+    """Dominant planes of one depth image in the camera frame, largest first (RANSAC on oriented points).
+
+    Args:
+        camera: intrinsics.
+        depth: (h, w) metres, 0 = no measurement.
+        rng: draws the candidates.
+        search: settings.
+    """
+    search = search or PlaneSearch()
+    step = max(1, camera.width // search.samples_across)
+    window = camera.window(0, 0, -(-camera.width // step), -(-camera.height // step), step)
+    grid = window.points(depth[::step, ::step])
+    normals, valid = _normals(grid)
+    points, normals = grid[valid], normals[valid]
+    least = search.min_share * max(1, int((depth[::step, ::step] > 0).sum()))
+    planes: list[Plane] = []
+    total = len(points)
+    while len(planes) < search.max_planes and len(points) > least:
+        inliers = _best_candidate(points, normals, rng, search)
+        if inliers.sum() < least:
+            break
+        planes.append(_fit(points[inliers], search, inliers.sum() / total))
+        points, normals = points[~inliers], normals[~inliers]
+    return tuple(planes)
+
+
+def plane_depth(planes: tuple[Plane, ...], camera: Camera) -> NDArray[np.float32]:
+    """Depth (h, w) of the nearest plane along each pixel's ray, metres; 0 where none is hit within its outline."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = camera.backproject(u, v, np.ones(u.shape))
+    nearest = np.full(u.shape, np.inf)
+    for plane in planes:
+        slope = rays @ plane.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = plane.offset / slope
+        z = np.where(np.isfinite(z) & (z > 0), z, np.inf)
+        hit = np.where(np.isfinite(z), z, 0.0)[..., None] * rays
+        nearest = np.where(np.isfinite(z) & plane.contains(hit), np.minimum(nearest, z), nearest)
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+
+
+def up_from_planes(planes: tuple[Plane, ...], up_guess: Array, max_angle_rad: float = 1.2) -> Array | None:
+    """The normal of the largest plane that could be level: within an angle of a guess (3,), or None."""
+    level = [p for p in planes if p.normal @ up_guess > np.cos(max_angle_rad)]
+    # a camera is held more or less upright: of two large planes the one nearer to the guess is the ground
+    best = max(level, key=lambda p: p.share * float(p.normal @ up_guess), default=None)
+    return None if best is None else best.normal
+
+
+def _normals(grid: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Normals (h, w, 3) towards the camera by central differences over two samples, and where they can be trusted."""
+    valid = grid[..., 2] > 0
+    across, down = np.zeros_like(grid), np.zeros_like(grid)
+    across[:, 2:-2] = grid[:, 4:] - grid[:, :-4]
+    down[2:-2] = grid[4:] - grid[:-4]
+    usable = valid.copy()
+    usable[:, 2:-2] &= valid[:, 4:] & valid[:, :-4]
+    usable[2:-2] &= valid[4:] & valid[:-4]
+    usable[:2], usable[-2:], usable[:, :2], usable[:, -2:] = False, False, False, False
+    # a jump in depth has no normal
+    jump = np.maximum(np.abs(across[..., 2]), np.abs(down[..., 2]))
+    usable &= jump < 0.15 * np.where(valid, grid[..., 2], 1.0)
+    normals = np.cross(across, down)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    usable &= length[..., 0] > 0
+    normals = normals / np.where(length == 0, 1.0, length)
+    towards = np.sign(-(normals * grid).sum(-1, keepdims=True))
+    return normals * np.where(towards == 0, 1.0, towards), usable
+
+
+def _best_candidate(
+    points: Array, normals: Array, rng: np.random.Generator, search: PlaneSearch
+) -> NDArray[np.bool_]:
+    picks = rng.integers(len(points), size=search.candidates)
+    n = normals[picks]
+    tolerance = search.tolerance_per_m * points[:, 2]
+    distance = np.abs(points @ n.T - (points[picks] * n).sum(-1))
+    near = (distance < tolerance[:, None]) & (normals @ n.T > np.cos(search.normal_tolerance_rad))
+    inliers = near[:, np.argmax(near.sum(0))]
+    for _ in range(3):
+        centre, normal = _least_squares(points[inliers])
+        distance = np.abs((points - centre) @ normal)
+        inliers = (distance < tolerance) & (np.abs(normals @ normal) > np.cos(search.normal_tolerance_rad))
+        if inliers.sum() < 10:
+            break
+    return np.asarray(inliers)
+
+
+def _least_squares(points: Array) -> tuple[Array, Array]:
+    """Mean (3,) and unit normal (3,) towards the origin of a plane through points (n, 3)."""
+    centre = points.mean(0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return centre, normal if normal @ centre < 0 else -normal
+
+
+def _fit(points: Array, search: PlaneSearch, share: float) -> Plane:
+    centre, normal = _least_squares(points)
+    x = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    x /= np.linalg.norm(x)
+    T = se3.make(np.stack([x, np.cross(normal, x), normal], axis=-1), centre)
+    flat = se3.transform(se3.inverse(T), points)[:, :2]
+    hull = cv2.convexHull(flat.astype(np.float32))[:, 0].astype(np.float64)
+    middle = hull.mean(0)
+    outward = (hull - middle) / np.linalg.norm(hull - middle, axis=-1, keepdims=True)
+    return Plane(normal, float(normal @ centre), T, hull + search.margin_m * outward, float(share))
