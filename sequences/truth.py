@@ -1,0 +1,170 @@
+"""The truth about a run, where it is known. No estimator imports this module.
+
+BOP's scene_gt.json says T_camera_object for the true camera, so T_world_object = T_world_camera_true T_camera_object.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sequences import layout, se3
+from sequences.errors import InputError
+from sequences.jsonfile import Node
+from sequences.types import Frame, Run, TrueObject, Truth, Visit
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Sighting:
+    """One entry of scene_gt.json."""
+
+    key: tuple[int, ...]
+    """(inst_id,), or, where the file names none, (visit, obj_id, k)"""
+    obj_id: int
+    frame: int
+    T_world_object: Array
+    visible_fraction: float
+
+
+def load_truth(run: Run) -> Truth | None:
+    """What was really where, from scene_gt.json and its companions; None where no visit has a scene_gt.json.
+
+    - `inst_id` says which physical object an entry is, over all visits. In a visit without inst_id the k-th entry of an obj_id
+      is taken to be one object in all frames of that visit, and another in each other visit.
+    - scene_camera_gt.json holds the true camera poses in the visit's frame; the recorded ones are taken where it is missing.
+    - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing.
+
+    Raises:
+        InputError: broken files; unknown obj_id; an inst_id that names two objects of one frame, or two classes.
+    """
+    cameras = np.stack([frame.T_world_camera for frame in run.frames]) if run.frames else np.zeros((0, 4, 4))
+    sightings: list[_Sighting] = []
+    found = False
+    for v, visit in enumerate(run.visits):
+        if not visit.frames:
+            continue
+        folder = visit.frames[0].depth_path.parent.parent
+        cameras[[frame.index for frame in visit.frames]] = _true_cameras(folder, visit)
+        if (folder / layout.SCENE_GT).is_file():
+            found = True
+            sightings += _sightings(folder, v, visit, run, cameras)
+    return Truth(_objects(sightings), cameras) if found else None
+
+
+def _true_cameras(folder: Path, visit: Visit) -> Array:
+    """(n, 4, 4) T_world_camera of the visit's frames."""
+    file = folder / layout.SCENE_CAMERA_GT
+    if not file.is_file():
+        return np.stack([frame.T_world_camera for frame in visit.frames])
+    root = Node.read(file, "")
+    poses = []
+    for frame in visit.frames:
+        pose = layout.camera_pose(root[str(frame.im_id)])
+        if pose is None:
+            raise root[str(frame.im_id)].error("the image has no true camera pose", "add cam_R_w2c and cam_t_w2c")
+        poses.append(visit.T_world_visit @ pose)
+    return np.stack(poses)
+
+
+def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array) -> list[_Sighting]:
+    entries = layout.image_entries(Node.read(folder / layout.SCENE_GT, ""))
+    visible = _visible_fractions(folder)
+    found: list[_Sighting] = []
+    given: set[bool] = set()
+    for frame in visit.frames:
+        if frame.im_id not in entries:
+            continue
+        elements = entries[frame.im_id].elements()
+        given |= {element.get("inst_id") is not None for element in elements}
+        if len(given) > 1:
+            raise entries[frame.im_id].error("some entries have an inst_id, others none", "give it to all, or to none")
+        key = _named if given == {True} else _counted(v)
+        in_frame: set[tuple[int, ...]] = set()
+        for k, element in enumerate(elements):
+            sighting = _sighting(element, frame, run, cameras, key, visible(frame.im_id, k))
+            if sighting.key in in_frame:
+                raise element["inst_id"].error("names two objects of one frame", "give each object its own inst_id")
+            in_frame.add(sighting.key)
+            found.append(sighting)
+    return found
+
+
+def _sighting(
+    node: Node, frame: Frame, run: Run, cameras: Array, key: Callable[[Node, int], tuple[int, ...]], visible: float
+) -> _Sighting:
+    obj_id = node["obj_id"].integer()
+    if obj_id not in run.catalogue:
+        raise node["obj_id"].error(f"unknown obj_id {obj_id}", "add its model to models/, or remove the entry")
+    T_camera_object = se3.make(layout.rotation(node["cam_R_m2c"]), node["cam_t_m2c"].numbers(3) * layout.MM)
+    return _Sighting(key(node, obj_id), obj_id, frame.index, cameras[frame.index] @ T_camera_object, visible)
+
+
+def _named(node: Node, obj_id: int) -> tuple[int, ...]:
+    return (node["inst_id"].integer(),)
+
+
+def _counted(v: int) -> Callable[[Node, int], tuple[int, ...]]:
+    """Keys for the entries of one frame by their order, the same in each frame of the visit and in no other visit."""
+    seen: Counter[int] = Counter()
+
+    def key(node: Node, obj_id: int) -> tuple[int, ...]:
+        seen[obj_id] += 1
+        return (v, obj_id, seen[obj_id])
+
+    return key
+
+
+def _visible_fractions(folder: Path) -> Callable[[int, int], float]:
+    file = folder / layout.SCENE_GT_INFO
+    if not file.is_file():
+        return lambda im_id, k: 1.0
+    entries = layout.image_entries(Node.read(file, ""))
+
+    def fraction(im_id: int, k: int) -> float:
+        elements = entries[im_id].elements() if im_id in entries else []
+        if k >= len(elements):
+            raise InputError(
+                f"has no entry {k} that scene_gt.json has",
+                file=file,
+                field=str(im_id),
+                remedy=f"write one entry for each of {layout.SCENE_GT}, or remove the file",
+            )
+        return elements[k]["visib_fract"].number()
+
+    return fraction
+
+
+def _objects(sightings: list[_Sighting]) -> tuple[TrueObject, ...]:
+    by_key: dict[tuple[int, ...], list[_Sighting]] = {}
+    for sighting in sightings:
+        by_key.setdefault(sighting.key, []).append(sighting)
+    # objects without an inst_id are numbered after those with one
+    last = max((key[0] for key in by_key if len(key) == 1), default=0)
+    names = {key: k for k, key in enumerate(sorted(key for key in by_key if len(key) > 1), start=last + 1)}
+    objects = [_object(names.get(key, key[0]), some) for key, some in by_key.items()]
+    return tuple(sorted(objects, key=lambda o: o.inst_id))
+
+
+def _object(inst_id: int, sightings: list[_Sighting]) -> TrueObject:
+    obj_ids = sorted({s.obj_id for s in sightings})
+    if len(obj_ids) > 1:
+        raise InputError(
+            f"inst_id {inst_id} is of classes {obj_ids}",
+            file=layout.SCENE_GT,
+            field="inst_id",
+            remedy="give each physical object an inst_id of its own",
+        )
+    return TrueObject(
+        inst_id=inst_id,
+        obj_id=obj_ids[0],
+        frames=np.array([s.frame for s in sightings], dtype=np.int64),
+        T_world_object=np.stack([s.T_world_object for s in sightings]),
+        visible_fraction=np.array([s.visible_fraction for s in sightings]),
+    )
