@@ -1,0 +1,80 @@
+"""Which pixels a map's objects would cover: boxes for the detection metrics and the exports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sequences import se3
+from sequences.camera import Camera
+from sequences.catalogue import Catalogue, Mesh
+from sequences.rendering.scene import render_scene
+
+Array = NDArray[np.float64]
+Box = tuple[float, float, float, float]
+
+
+class Silhouette(NamedTuple):
+    """One object in an image, in front of and behind the others."""
+
+    pixels: int
+    """pixels of the image that it covers were it alone; 0 where it is out of view"""
+    visible_pixels: int
+    """pixels of those where no other object of the map is nearer"""
+    visible_box: Box | None
+    """x, y, width, height of the enclosing box of the visible pixels (COCO); None where there are none"""
+
+    @property
+    def visible_fraction(self) -> float:
+        """Visible share of what lies in the image; 0 out of view."""
+        return self.visible_pixels / self.pixels if self.pixels else 0.0
+
+
+def silhouettes(
+    catalogue: Catalogue, class_id: Sequence[int] | NDArray[np.int64], T_camera_object: Array, camera: Camera
+) -> list[Silhouette]:
+    """Draw n objects of the map, obj_ids (n,) at poses (n, 4, 4), into one camera; clutter without a mesh hides nothing."""
+    drawn = [_draw(catalogue[int(c)].mesh, T, camera) for c, T in zip(class_id, T_camera_object, strict=True)]
+    nearest = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    for window, depth in drawn:
+        np.minimum(nearest[window], depth, out=nearest[window])
+    return [_silhouette(window, depth, nearest) for window, depth in drawn]
+
+
+def _draw(mesh: Mesh, T: Array, camera: Camera) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
+    """The window (rows, columns) that the mesh may cover, and its depth there, infinite where nothing is."""
+    x, y, width, height = _window(mesh, T, camera)
+    rows, columns = slice(y, y + height), slice(x, x + width)
+    if not width or not height:
+        return (rows, columns), np.zeros((height, width), dtype=np.float32)
+    depth = render_scene([(mesh, T)], camera.window(x, y, width, height)).depth
+    return (rows, columns), np.where(depth > 0, depth, np.float32(np.inf))
+
+
+def _window(mesh: Mesh, T: Array, camera: Camera) -> tuple[int, int, int, int]:
+    points = se3.transform(T, mesh.vertices)
+    if points[:, 2].max() <= 0:
+        return 0, 0, 0, 0
+    if points[:, 2].min() <= 0:  # it reaches behind the camera: its projection has no bounds
+        return 0, 0, camera.width, camera.height
+    size = np.array([camera.width, camera.height])
+    pixels = camera.project(points)
+    low = np.clip(np.ceil(pixels.min(axis=0)), 0, size).astype(int)
+    high = np.clip(np.floor(pixels.max(axis=0)) + 1, low, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def _silhouette(
+    window: tuple[slice, slice], depth: NDArray[np.float32], nearest: NDArray[np.float32]
+) -> Silhouette:
+    covered = np.isfinite(depth)
+    visible = covered & (depth <= nearest[window])
+    if not visible.any():
+        return Silhouette(int(covered.sum()), 0, None)
+    rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
+    x, y = window[1].start + columns[0], window[0].start + rows[0]
+    box = (float(x), float(y), float(columns[-1] - columns[0] + 1), float(rows[-1] - rows[0] + 1))
+    return Silhouette(int(covered.sum()), int(visible.sum()), box)
