@@ -1,0 +1,17 @@
+"""How many threads the libraries under us may start."""
+
+from __future__ import annotations
+
+import os
+
+_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+def limit_library_threads() -> None:
+    """One thread for each BLAS and OpenMP pool, unless the environment says otherwise; call it before importing NumPy.
+
+    Our kernels are parallel over hypotheses by numba, and our matrices are small: a pool in every library
+    would only have them fight for the same cores, and a sum split over threads depends on their number.
+    """
+    for name in _POOLS:
+        os.environ.setdefault(name, "1")
