@@ -1,8 +1,8 @@
 """A numba z-buffer: the renderer the estimators score with. No OpenGL, no system library.
 
-Within a triangle 1/z is linear in the image, so it is interpolated with the edge functions (Pineda, SIGGRAPH 1988); pixels are
-sampled at their centres, which lie at whole numbers. Triangles that reach behind the near plane are left out: a
-hypothesis so close to the camera is not one.
+Within a triangle 1/z is linear in the image, so it is interpolated with the edge functions (Pineda, SIGGRAPH 1988);
+pixels are sampled at their centres, which lie at whole numbers. Triangles that reach behind the near plane are left
+out: a hypothesis so close to the camera is not one.
 """
 
 from __future__ import annotations
@@ -100,9 +100,13 @@ class Rasteriser:
 
     name = "rasteriser"
 
+    def available(self) -> str | None:
+        """None: it needs nothing from the system."""
+        return None
+
     def render(self, mesh: Mesh, camera: Camera, T_camera_object: Array) -> NDArray[np.float32]:
-        """Depth images (K, height, width), metres along z, 0 where nothing is, for poses (K, 4, 4)."""
-        poses = np.ascontiguousarray(T_camera_object, dtype=np.float64)
+        """See `DepthRenderer.render`."""
+        poses = np.ascontiguousarray(T_camera_object, dtype=np.float64).reshape(-1, 4, 4)
         depth = np.zeros((len(poses), camera.height, camera.width), dtype=np.float32)
         _render(mesh.vertices, mesh.faces, poses, intrinsics(camera), depth)
         return depth
