@@ -6,17 +6,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ctmap_gtsam.parameters import (
+    Context,
+    Detector,
+    Filter,
+    Frontend,
+    Keyframes,
+    Prediction,
+    Sensor,
+    Smoother,
+)
 from ctmap_gtsam.runtime import settings
 from sequences.options import option
-
-
-@dataclass(frozen=True)
-class Keyframes:
-    """Which frames the estimators use. A frame is a keyframe where it is the first of a visit or meets all three."""
-
-    every: int = option(1, "use every n-th frame", low=1)
-    min_translation_m: float = option(0.0, "and only after the camera moved so far, metres ...", low=0.0)
-    min_rotation_rad: float = option(0.0, "... or turned so far, rad", low=0.0)
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,13 @@ class Config:
 
     seed: int = option(0, "every random draw depends on this and on what it is for, nothing else", low=0)
     keyframes: Keyframes = field(default_factory=Keyframes)
+    sensor: Sensor = field(default_factory=Sensor)
+    detector: Detector = field(default_factory=Detector)
+    prediction: Prediction = field(default_factory=Prediction)
+    context: Context = field(default_factory=Context)
+    frontend: Frontend = field(default_factory=Frontend)
+    filter: Filter = field(default_factory=Filter)
+    smoother: Smoother = field(default_factory=Smoother)
 
     def __post_init__(self) -> None:
         settings.check(self)

@@ -1,0 +1,104 @@
+"""The settings of the model and of the estimators, by section; `ctmap_gtsam.config` holds them in one tree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sequences.options import option
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """Which frames the estimators use. A frame is a keyframe where it is the first of a visit or meets all three."""
+
+    every: int = option(1, "use every n-th frame", low=1)
+    min_translation_m: float = option(0.0, "and only after the camera moved so far, metres ...", low=0.0)
+    min_rotation_rad: float = option(0.0, "... or turned so far, rad", low=0.0)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The depth camera."""
+
+    sigma_m: float = option(0.002, "noise floor of sensor, mesh and calibration together, metres", low=1e-5)
+    sigma_quadratic_per_m: float = option(0.0015, "growth of the noise with squared depth, 1/m", low=0.0)
+    outlier_weight: float = option(0.02, "share of pixels that say nothing", low=1e-6, high=0.5)
+    range_m: float = option(8.0, "the largest depth the sensor gives, metres", low=0.1)
+    occluder_weight: float = option(0.15, "chance that something stands before a known background", low=0.0, high=0.9)
+    background_sigma_m: float = option(0.005, "how well a background plane's depth is known, metres", low=0.0)
+    kappa: float = option(0.03, "one over the number of samples whose noise is correlated", low=0.0, high=1.0)
+    occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What is believed of the detector."""
+
+    detection_probability: float = option(0.9, "of an object in full view", low=0.01, high=0.999)
+    box_sigma: float = option(0.05, "scale of a box edge's error, as a share of the box's size", low=0.005)
+    box_outlier: float = option(0.02, "share of boxes that have nothing to do with the object", low=1e-6, high=0.5)
+    confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
+    score_floor: float = option(0.005, "class scores below this are taken for this", low=1e-9, high=0.1)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How objects move from keyframe to keyframe."""
+
+    rotation_rate: float = option(0.01, "random walk in view, rad per sqrt(s)", low=1e-6)
+    translation_rate: float = option(0.002, "random walk in view, metres per sqrt(s)", low=1e-6)
+    jump_probability: float = option(1e-4, "chance a keyframe that a pose in view is elsewhere nearby", low=0.0, high=0.5)
+    stay_limit: float = option(0.5, "r1 of Equation 2: P(stay) after an endless absence", low=0.0, high=1.0)
+    significant_period_s: float = option(10.0, "absences shorter than this can't hold a move, s", low=0.0)
+
+
+@dataclass(frozen=True)
+class Context:
+    """Relations between objects."""
+
+    category_weight: float = option(0.5, "w1 of Equation 5", low=0.0, high=1.0)
+    instance_weight: float = option(0.5, "w2 of Equation 5", low=0.0, high=1.0)
+    same_category_ratio: float = option(2.0, "how much more often one category meets itself nearby", low=0.01)
+    neighbour_sigma_m: float = option(0.5, "scale of 'nearby', metres", low=0.01)
+    support_sigma_m: float = option(0.01, "how far a thing may float over or sink into its support, metres", low=1e-4)
+    penetration_sigma_m: float = option(0.01, "how deep objects may seem to intersect, metres", low=1e-4)
+
+
+@dataclass(frozen=True)
+class Frontend:
+    """Tracks and proposals, shared by filter and smoother."""
+
+    association_iou: float = option(0.4, "least overlap of a box with its track's predicted box", low=0.0, high=1.0)
+    start_after: int = option(3, "consistent frames before a track is estimated", low=1)
+    lost_after_s: float = option(2.0, "a track without a box for so long in view is not continued, s", low=0.0)
+    angular_step_rad: float = option(0.005, "depth is sampled at this step", low=1e-4)
+    region_margin: float = option(0.5, "depth is scored in the box enlarged by this share on each side", low=0.0)
+    mesh_faces: int = option(500, "triangles of the meshes that score", low=20)
+    fresh_poses: int = option(1000, "random poses a class in a full search", low=1)
+    refined_poses: int = option(48, "of these, so many are refined on depth", low=1)
+    perturbed_poses: int = option(4, "second starts around each of the best", low=0)
+    max_modes: int = option(4, "poses kept a class, track and keyframe", low=1)
+    refinement_steps: int = option(20, "steps of the registration on depth", low=1)
+    refinement_widths_m: tuple[float, float] = option((0.03, 0.004), "its robust width at first and at last, metres")
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The particle filter, the paper's Algorithm 1."""
+
+    particles: int = option(300, "particles an object (the paper's M)", low=10)
+    min_particles: int = option(24, "of a class that is still possible", low=1)
+    proposal_share: float = option(0.5, "particles drawn around refined modes rather than from the prediction", high=0.95)
+    search_every: int = option(5, "keyframes between fresh searches", low=1)
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """The factor graph and its rounds."""
+
+    rounds: int = option(2, "re-weighting rounds after the first, at most", low=2)
+    searches: int = option(5, "keyframes of a track with a full search", low=1)
+    max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
+    tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
+    bias_rotation_rad: float = option(0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6)
+    bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
