@@ -1,7 +1,8 @@
 """Runs on disk: BOP datasets with a few files of ours beside (docs/run-layout.md).
 
-`load_run` reads all that an estimator may see and nothing of the truth; `load_truth` reads the truth. Everything cheap is
-checked here (all JSON, the header of each image); pixels are read, and judged, when a frame is asked for them.
+`load_run` reads all that an estimator may see and nothing of the truth; `load_truth` reads the truth; `RunWriter`
+writes both. Everything cheap is checked at once (all JSON, the header of each image); pixels are read, and judged, when
+a frame is asked for them.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +27,9 @@ from sequences.meshes import load_mesh
 from sequences.problems import Checks
 from sequences.truth import load_truth
 from sequences.types import Detection, Frame, LocalisationNoise, Run, Visit
+from sequences.writing import FrameTruth, RunWriter, Sighting
 
-__all__ = ["load_catalogue", "load_run", "load_truth"]
+__all__ = ["FrameTruth", "RunWriter", "Sighting", "load_catalogue", "load_run", "load_truth"]
 
 Array = NDArray[np.float64]
 
@@ -74,7 +77,9 @@ def read_run(root: Path, scene: int | None, checks: Checks) -> Run:
     description = None
     with checks.part():
         description = read_description(root, catalogue, checks)
-    chosen = _choose(root, scenes, description, scene)
+    # in a gathering run ctmap.json may be there and broken: its scenes are then taken to be visits all the same
+    listed = tuple(s.scene_id for s in scenes) if description is None else tuple(description.visits)
+    chosen = _choose(root, scenes, listed, scene)
     image_camera = None
     with checks.part():
         image_camera = _read_camera(root, required=description is not None, checks=checks)
@@ -94,7 +99,7 @@ def read_run(root: Path, scene: int | None, checks: Checks) -> Run:
         up_world=None if description is None else description.up_world,
         localisation=LocalisationNoise() if description is None else description.localisation,
         fingerprint=_fingerprint(root, catalogue, chosen, ordered),
-        notes=tuple(checks.notes),
+        notes=(*checks.notes, *map(str, checks.problems)) if checks.strict else tuple(checks.notes),
     )
 
 
@@ -227,33 +232,31 @@ def _read_localisation(node: Node | None) -> LocalisationNoise:
 
 
 def _choose(
-    root: Path, scenes: tuple[layout.Scene, ...], description: Description | None, scene: int | None
+    root: Path, scenes: tuple[layout.Scene, ...], listed: tuple[int, ...], scene: int | None
 ) -> tuple[layout.Scene, ...]:
-    """The scenes to read."""
+    """The scenes to read: `scene`, or all that are listed as visits of the place."""
     found = {s.scene_id: s for s in scenes}
-    listed = ", ".join(map(str, found))
+    names = ", ".join(map(str, found))
     if scene is not None:
         if scene not in found:
-            raise InputError(f"no scene {scene}", file=root, field="scene", remedy=f"choose one of {listed}")
+            raise InputError(f"no scene {scene}", file=root, field="scene", remedy=f"choose one of {names}")
         return (found[scene],)
-    if description is None:
-        if len(scenes) > 1:
-            raise InputError(
-                f"holds {len(scenes)} scenes and no {layout.CTMAP} that makes them visits of one place",
-                file=root,
-                field="scene",
-                remedy=f"choose one of them with --scene (scene= in Python): {listed}",
-            )
-        return scenes
-    missing = [scene_id for scene_id in description.visits if scene_id not in found]
+    if len(scenes) > 1 and not (root / layout.CTMAP).is_file():
+        raise InputError(
+            f"holds {len(scenes)} scenes and no {layout.CTMAP} that makes them visits of one place",
+            file=root,
+            field="scene",
+            remedy=f"choose one of them with --scene (scene= in Python): {names}",
+        )
+    missing = [scene_id for scene_id in listed if scene_id not in found]
     if missing:
         raise InputError(
             f"lists scene {missing[0]}, which has no folder",
             file=root / layout.CTMAP,
             field="visits",
-            remedy=f"add the scene's folder, or list only {listed}",
+            remedy=f"add the scene's folder, or list only {names}",
         )
-    return tuple(found[scene_id] for scene_id in description.visits)
+    return tuple(found[scene_id] for scene_id in listed)
 
 
 # --- one visit ---
@@ -389,10 +392,7 @@ def _times(scene: layout.Scene, entries: dict[int, Node], *, alone: bool, checks
 def _intrinsics(node: Node, image_camera: _ImageCamera | None, depth: Path) -> tuple[Camera, float]:
     """The camera of one image and its depth_scale, mm a count."""
     known = image_camera or _ImageCamera(None, None, None)
-    if node.get("cam_K") is None and known.K is not None:
-        K = known.K
-    else:
-        K = _calibration(node["cam_K"])
+    K = known.K if node.get("cam_K") is None and known.K is not None else _calibration(node["cam_K"])
     scale_node = node.get("depth_scale")
     if scale_node is None and known.depth_scale is not None:
         scale = known.depth_scale
@@ -528,7 +528,7 @@ def _class_scores(node: Node, catalogue: Catalogue) -> tuple[Array, bool]:
 def _in_order_of_time(visits: list[Visit]) -> tuple[Visit, ...]:
     """Visits one after the other, frames numbered through the run."""
     ordered = sorted((v for v in visits if v.frames), key=lambda v: v.frames[0].time_ns)
-    for before, after in zip(ordered, ordered[1:], strict=False):
+    for before, after in pairwise(ordered):
         if after.frames[0].time_ns <= before.frames[-1].time_ns:
             raise InputError(
                 f"visit {after.scene_id} starts before visit {before.scene_id} ends",

@@ -76,7 +76,7 @@ class Node:
         return value
 
     def flag(self) -> bool:
-        """true or false."""
+        """A truth value."""
         value: bool = self._expect(bool, "true or false")
         return value
 

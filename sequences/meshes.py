@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sequences.catalogue import Mesh
 from sequences.errors import InputError
-
-if TYPE_CHECKING:
-    import trimesh
 
 GREY = 128
 _MM = 1e-3
@@ -24,14 +21,14 @@ def load_mesh(path: Path) -> Mesh:
     Colours come from the vertices, or are sampled at the vertices from a texture, or are the mean of the faces around.
 
     Raises:
-        InputError: no such file, not a PLY, no faces, a coordinate that isn't finite, a face with a vertex that isn't there.
+        InputError: no such file, not a PLY, no faces, a coordinate that isn't finite, a face without its vertices.
     """
     import trimesh
 
     if not path.is_file():
         raise InputError("the mesh is missing", file=path, field="(whole file)", remedy="add it, or drop the class")
     try:
-        loaded = trimesh.load(path, file_type="ply", process=False, force="mesh")
+        loaded: Any = trimesh.load(path, file_type="ply", process=False, force="mesh")
     except Exception as error:  # trimesh's PLY reader raises whatever its parsing runs into
         raise _bad(path, "header", f"not a PLY that can be read ({error})", "export the mesh as PLY") from error
     vertices = np.array(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64) * _MM
@@ -51,12 +48,12 @@ def encode_mesh(mesh: Mesh) -> bytes:
     import trimesh
 
     out = trimesh.Trimesh(mesh.vertices / _MM, mesh.faces, vertex_colors=mesh.colours, process=False)
-    data: bytes = out.export(file_type="ply")
-    return data
+    data: Any = out.export(file_type="ply")
+    return bytes(data)
 
 
 def simplify(mesh: Mesh, faces: int) -> Mesh:
-    """A copy of at most `faces` triangles or thereabouts, by quadric decimation; the mesh itself where it is small enough.
+    """A copy of at most `faces` triangles or thereabouts, by quadric decimation; the mesh itself where it has no more.
 
     Garland and Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997. Vertices at one place are
     welded first, or the seams of a texture would tear; each takes the colour of the nearest vertex of `mesh`.
@@ -92,7 +89,8 @@ def diameter(mesh: Mesh) -> float:
     return float(pdist(corners).max())
 
 
-def _vertex_colours(loaded: trimesh.Trimesh, n: int) -> NDArray[np.uint8]:
+def _vertex_colours(loaded: Any, n: int) -> NDArray[np.uint8]:
+    """(n, 3) of a trimesh.Trimesh."""
     visual = loaded.visual
     if visual.kind == "texture":
         visual = visual.to_color()

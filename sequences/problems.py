@@ -63,9 +63,8 @@ class Checks:
             self.problems.append(Problem.of(error))
 
     def warn(self, message: str, *, file: Path, field: str, remedy: str) -> None:
-        """Something odd that doesn't keep the run from being loaded; also among the run's notes."""
+        """Something odd that doesn't keep the run from being loaded."""
         self.problems.append(Problem(file, field, message, remedy, "warning"))
-        self.notes.append(f"{file.name}: {field}: {message}")
 
     def note(self, text: str) -> None:
         """A default that was derived."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sequences import layout, se3
 from sequences.errors import InputError
 from sequences.jsonfile import Node
+from sequences.problems import Checks
 from sequences.types import Frame, Run, TrueObject, Truth, Visit
 
 Array = NDArray[np.float64]
@@ -36,14 +37,19 @@ class _Sighting:
 def load_truth(run: Run) -> Truth | None:
     """What was really where, from scene_gt.json and its companions; None where no visit has a scene_gt.json.
 
-    - `inst_id` says which physical object an entry is, over all visits. In a visit without inst_id the k-th entry of an obj_id
-      is taken to be one object in all frames of that visit, and another in each other visit.
-    - scene_camera_gt.json holds the true camera poses in the visit's frame; the recorded ones are taken where it is missing.
+    - `inst_id` says which physical object an entry is, over all visits. In a visit without inst_id the k-th entry of an
+      obj_id is taken to be one object in all frames of that visit, and another in each other visit.
+    - scene_camera_gt.json holds the true camera poses in the visit's frame; where it is missing the recorded ones count.
     - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing.
 
     Raises:
         InputError: broken files; unknown obj_id; an inst_id that names two objects of one frame, or two classes.
     """
+    return read_truth(run, Checks())
+
+
+def read_truth(run: Run, checks: Checks) -> Truth | None:
+    """As `load_truth`; with gathering checks, the truth without the frames that are wrong, for `inspect_run` alone."""
     cameras = np.stack([frame.T_world_camera for frame in run.frames]) if run.frames else np.zeros((0, 4, 4))
     sightings: list[_Sighting] = []
     found = False
@@ -51,29 +57,32 @@ def load_truth(run: Run) -> Truth | None:
         if not visit.frames:
             continue
         folder = visit.frames[0].depth_path.parent.parent
-        cameras[[frame.index for frame in visit.frames]] = _true_cameras(folder, visit)
+        with checks.part():
+            cameras[[frame.index for frame in visit.frames]] = _true_cameras(folder, visit, checks)
         if (folder / layout.SCENE_GT).is_file():
             found = True
-            sightings += _sightings(folder, v, visit, run, cameras)
-    return Truth(_objects(sightings), cameras) if found else None
+            with checks.part():
+                sightings += _sightings(folder, v, visit, run, cameras, checks)
+    return Truth(_objects(sightings, checks), cameras) if found else None
 
 
-def _true_cameras(folder: Path, visit: Visit) -> Array:
+def _true_cameras(folder: Path, visit: Visit, checks: Checks) -> Array:
     """(n, 4, 4) T_world_camera of the visit's frames."""
     file = folder / layout.SCENE_CAMERA_GT
     if not file.is_file():
         return np.stack([frame.T_world_camera for frame in visit.frames])
     root = Node.read(file, "")
-    poses = []
-    for frame in visit.frames:
-        pose = layout.camera_pose(root[str(frame.im_id)])
-        if pose is None:
-            raise root[str(frame.im_id)].error("the image has no true camera pose", "add cam_R_w2c and cam_t_w2c")
-        poses.append(visit.T_world_visit @ pose)
-    return np.stack(poses)
+    poses = np.stack([frame.T_world_camera for frame in visit.frames])
+    for k, frame in enumerate(visit.frames):
+        with checks.part():
+            pose = layout.camera_pose(root[str(frame.im_id)])
+            if pose is None:
+                raise root[str(frame.im_id)].error("the image has no true camera pose", "add cam_R_w2c and cam_t_w2c")
+            poses[k] = visit.T_world_visit @ pose
+    return poses
 
 
-def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array) -> list[_Sighting]:
+def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array, checks: Checks) -> list[_Sighting]:
     entries = layout.image_entries(Node.read(folder / layout.SCENE_GT, ""))
     visible = _visible_fractions(folder)
     found: list[_Sighting] = []
@@ -88,11 +97,12 @@ def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array) -> 
         key = _named if given == {True} else _counted(v)
         in_frame: set[tuple[int, ...]] = set()
         for k, element in enumerate(elements):
-            sighting = _sighting(element, frame, run, cameras, key, visible(frame.im_id, k))
-            if sighting.key in in_frame:
-                raise element["inst_id"].error("names two objects of one frame", "give each object its own inst_id")
-            in_frame.add(sighting.key)
-            found.append(sighting)
+            with checks.part():
+                sighting = _sighting(element, frame, run, cameras, key, visible(frame.im_id, k))
+                if sighting.key in in_frame:
+                    raise element["inst_id"].error("names two objects of one frame", "give each object its own inst_id")
+                in_frame.add(sighting.key)
+                found.append(sighting)
     return found
 
 
@@ -141,14 +151,17 @@ def _visible_fractions(folder: Path) -> Callable[[int, int], float]:
     return fraction
 
 
-def _objects(sightings: list[_Sighting]) -> tuple[TrueObject, ...]:
+def _objects(sightings: list[_Sighting], checks: Checks) -> tuple[TrueObject, ...]:
     by_key: dict[tuple[int, ...], list[_Sighting]] = {}
     for sighting in sightings:
         by_key.setdefault(sighting.key, []).append(sighting)
     # objects without an inst_id are numbered after those with one
     last = max((key[0] for key in by_key if len(key) == 1), default=0)
     names = {key: k for k, key in enumerate(sorted(key for key in by_key if len(key) > 1), start=last + 1)}
-    objects = [_object(names.get(key, key[0]), some) for key, some in by_key.items()]
+    objects = []
+    for key, some in by_key.items():
+        with checks.part():
+            objects.append(_object(names.get(key, key[0]), some))
     return tuple(sorted(objects, key=lambda o: o.inst_id))
 
 
