@@ -99,25 +99,23 @@ def discretise(discrete: Array, continuous: tuple[ContinuousSymmetry, ...]) -> A
 
 
 def translation_error(estimated: Shape, T_estimated: Array, true: Shape, T_true: Array) -> Array:
-    """Distance between the centres of the two bounding boxes, the least over the true object's symmetries.
+    """Distance between the centres of the two bounding boxes.
 
     Args:
         estimated: shape of the estimated class, which may be the wrong one.
         T_estimated: (..., 4, 4) its pose, metres.
-        true: shape of the true class. Its symmetries count only where the two classes are one: a wrong class has
-            no orientation that could agree.
+        true: shape of the true class. Where the two classes are one, the true pose is taken up to symmetry: at the
+            symmetric twin that MSSD finds the nearest.
         T_true: (..., 4, 4) its pose in the same frame of reference.
 
     Returns:
         (...) metres. (The translation error of Hodan et al., On Evaluation of 6D Object Pose Estimation, ECCVW 2016,
-        taken at the centre of the box instead of the mesh's origin, and up to symmetry.)
+        taken at the centre of the box instead of the mesh's origin, since origins differ from class to class.)
     """
-    centre = se3.transform(T_estimated, estimated.centre[None])[..., 0, :]
-    if estimated.of.obj_id != true.of.obj_id:
-        return np.linalg.norm(centre - se3.transform(T_true, true.centre[None])[..., 0, :], axis=-1)
-    same_places = se3.transform(true.symmetries, true.centre[None])[:, 0, :]  # (S, 3)
-    candidates = se3.transform(T_true, same_places)
-    return np.linalg.norm(centre[..., None, :] - candidates, axis=-1).min(axis=-1)
+    if estimated.of.obj_id == true.of.obj_id:
+        T_true = T_true @ true.symmetries[_nearest_twin(true, T_estimated, T_true)[1]]
+    ours, theirs = se3.transform(T_estimated, estimated.centre[None]), se3.transform(T_true, true.centre[None])
+    return np.linalg.norm(ours - theirs, axis=-1)[..., 0]
 
 
 def rotation_error(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
@@ -147,10 +145,7 @@ def mssd(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
 
     Poses (..., 4, 4) -> (...) metres: ``min_S max_x |T_estimated x - T_true S x|``.
     """
-    batch = T_estimated.shape[:-2]
-    difference = T_estimated[..., None, :, :] - T_true[..., None, :, :] @ shape.symmetries  # (..., S, 4, 4)
-    maps = np.ascontiguousarray(difference.reshape(-1, len(shape.symmetries), 4, 4)[:, :, :3, :])
-    return _least_maximum(maps, np.ascontiguousarray(shape.extreme_points)).reshape(batch)
+    return _nearest_twin(shape, T_estimated, T_true)[0]
 
 
 def add(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
@@ -173,10 +168,19 @@ def adds(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
     return distance.mean(axis=-1)
 
 
+def _nearest_twin(shape: Shape, T_estimated: Array, T_true: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Poses (..., 4, 4) -> MSSD (...), metres, and the symmetry (...) that attains it."""
+    batch = T_estimated.shape[:-2]
+    difference = T_estimated[..., None, :, :] - T_true[..., None, :, :] @ shape.symmetries  # (..., S, 4, 4)
+    maps = np.ascontiguousarray(difference.reshape(-1, len(shape.symmetries), 4, 4)[:, :, :3, :])
+    distance, index = _least_maximum(maps, np.ascontiguousarray(shape.extreme_points))
+    return distance.reshape(batch), index.reshape(batch)
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _least_maximum(maps, points):
-    """Maps (N, S, 3, 4) on points (H, 3) -> (N,) min over S of max over H of the length of the image."""
-    out = np.empty(maps.shape[0])
+    """Maps (N, S, 3, 4) on points (H, 3) -> min over S of max over H of the length of the image, and its S: (N,) each."""
+    out, index = np.empty(maps.shape[0]), np.zeros(maps.shape[0], np.int64)
     for n in range(maps.shape[0]):
         least = np.inf
         for s in range(maps.shape[1]):
@@ -191,6 +195,7 @@ def _least_maximum(maps, points):
                 largest = max(largest, square)
                 if largest >= least:  # this symmetry can't win any more
                     break
-            least = min(least, largest)
+            if largest < least:
+                least, index[n] = largest, s
         out[n] = np.sqrt(least)
-    return out
+    return out, index

@@ -93,7 +93,7 @@ def test_turns_about_a_symmetry_axis_count_for_nothing(seed, turn, tilt):
     T = random_poses(seed, 1)[0]
     spin = about((0.01, -0.02, 0.03), se3.so3_exp(np.array([0, 0, turn])))
     assert pose.rotation_error(ROUND, T @ spin, T) == pytest.approx(0, abs=1e-7)
-    assert pose.translation_error(ROUND, T @ spin, ROUND, T) == pytest.approx(0, abs=1e-9)
+    assert pose.translation_error(ROUND, T @ spin, ROUND, T) == pytest.approx(0, abs=1e-9)  # the line meets the centre
     # a full turn is cut into steps, so half a step is what may be left: the corners' radius times 0.01 rad
     assert pose.mssd(ROUND, T @ spin, T) < np.hypot(0.05, 0.05) * np.pi / pose.CONTINUOUS_STEPS + 1e-9
     tilted = T @ spin @ se3.exp(np.array([tilt, 0, 0, 0, 0, 0]))
