@@ -1,6 +1,6 @@
 """The measurement potential phi_m: what a depth image, a box and a score vector say about one object.
 
-**Depth.** The paper scores f = exp(-lambda SSD) over a box (Equation 4). A sum or mean over the pixels that a
+**Depth.** The paper scores f = exp(-lambda SSD) over a box (Equation 6). A sum or mean over the pixels that a
 hypothesis covers compares hypotheses on different data, so a small model hides inside a large one's surface; and
 lambda has no unit. Here every pixel contributes the log-likelihood ratio
 
@@ -17,6 +17,29 @@ being seen is no evidence), a surface where the object says one gains some nats,
 log[w / range / p(z | no object)], a bounded but large loss. p_b is uniform over the range where nothing is known. Where
 the depth behind the object is known (the support plane, or the rest of the map), it is a Gaussian there with occluders
 uniform in front of it.
+
+Neighbouring pixels err together (calibration, mesh, pose), so that their sum counts the same evidence many times. It is
+tempered with kappa, one over the number of pixels whose noise is correlated, which `correlated_pixels` fits from
+residuals.
+
+**Detection.** The paper's g = sum_k h l f takes scores and overlaps for likelihoods; a hypothesis gains by leaving its
+box, since it then has fewer terms and is judged by f alone. In a clutter model the detections S_t of an object that is
+seen with probability p_D v (v its visible fraction) have the likelihood ratio, against being all false alarms,
+
+    (1 - p_D v) + p_D v sum_k [ l(box_k) / u(box_k) ] [ p(s_k | c) / p(s_k | clutter) ] / (false alarms an image)
+
+with normalised densities l of boxes around the rendered one, and u uniform over boxes of the image. A missed detection
+costs log(1 - p_D v), a fully hidden object pays nothing.
+
+**Class.** A detector is wrong the same way for many frames: its answers in a visit hang on one persistent belief d, and
+log sum_d pi(d | c) prod_t p(s_t | d) saturates at the log ratios of pi, however many frames repeat it.
+
+**In the graph** the depth image's likelihood is held by modes: Gaussians in the pose relative to the camera, found and
+measured on the score itself. Their errors within one visit are correlated, which a bias b shared by the visit carries:
+
+    r = log(T_camera_mode^-1 T_world_camera^-1 T_world_object) - b,        -1/2 r^T L r + 1/2 log det(L / 2 pi)
+
+At the mode this equals the mixture's energy in `factors.mixture`.
 """
 
 from __future__ import annotations
@@ -27,6 +50,10 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from factors.mixture import gaussian_log_density, log_sum
+from factors.symmetry import NONE, Symmetry, residual, residual_jacobians
+from sequences import se3
 
 Array = NDArray[np.float64]
 DepthParameters = tuple[float, float, float, float, float, float]
@@ -153,3 +180,235 @@ def depth_log_ratio(
     out = np.empty(flat[0].size)
     _log_ratios(*flat, (model or DepthModel()).parameters(), out)
     return out.reshape(arrays[0].shape)
+
+
+def tempered(log_ratio_sum: ArrayLike, kappa: ArrayLike) -> Array:
+    """A sum (...) of pixel log ratios times kappa: the evidence of an image whose pixels err together."""
+    return np.asarray(kappa, dtype=np.float64) * np.asarray(log_ratio_sum, dtype=np.float64)
+
+
+def correlated_pixels(residuals: ArrayLike) -> float:
+    """How many pixels share one piece of noise: Var(sum of residuals) / sum of Var. 1 / it is kappa.
+
+    The autocorrelation is summed over rings of growing distance until one isn't positive any more (Geyer's initial
+    positive sequence, Statistical Science 1992, in two dimensions). No mean is taken off: a bias over a whole
+    image is noise that all its pixels share, and gives their full number.
+
+    Args:
+        residuals: (..., h, w) of depth at true poses, of expectation zero; NaN where nothing was compared.
+
+    Returns:
+        A number from 1 to the mean number of compared pixels an image.
+
+    Raises:
+        ValueError: where no residual is finite and different from zero.
+    """
+    images = np.asarray(residuals, dtype=np.float64)
+    images = images.reshape(-1, *images.shape[-2:])
+    height, width = images.shape[1:]
+    mask = np.isfinite(images)
+    values = np.where(mask, images, 0.0)
+    # the products of all pairs of pixels by their lag, added over images; zero padding keeps lags from wrapping round
+    spectrum = np.fft.rfft2(values, s=(2 * height, 2 * width))
+    products = np.fft.irfft2((spectrum * spectrum.conj()).sum(axis=0).real, s=(2 * height, 2 * width))
+    power = float((values**2).sum())
+    if not power > 0.0:
+        raise ValueError("correlated_pixels needs residuals that are finite and not all zero")
+    lag_v, lag_u = np.fft.fftfreq(2 * height, 0.5 / height), np.fft.fftfreq(2 * width, 0.5 / width)
+    ring = np.rint(np.hypot(lag_v[:, None], lag_u[None, :])).astype(np.int64)
+    by_ring = np.bincount(ring.ravel(), weights=products.ravel())
+    ended = np.flatnonzero(by_ring <= 1e-9 * power)
+    total = by_ring[: ended[0]].sum() if len(ended) else by_ring.sum()
+    return float(np.clip(total / power, 1.0, mask.sum() / len(images)))
+
+
+def detection_log_ratio(
+    p_detect: ArrayLike,
+    visible_fraction: ArrayLike,
+    box_log_ratios: ArrayLike,
+    class_log_ratios: ArrayLike,
+    clutter_per_image: float = 1.0,
+) -> Array:
+    """log[(1 - p_D v) + p_D v sum_k l_k p(s_k | c) / p(s_k | clutter) / clutter_per_image] in nats.
+
+    Args:
+        p_detect: (...) p_D of the object's class, in full view.
+        visible_fraction: (...) v, the share of its silhouette in view and not occluded: 0 gives 0 nats.
+        box_log_ratios: (..., K) from `box_log_ratio`; K may be 0.
+        class_log_ratios: (..., K) from `class_log_ratio`, at the object's class.
+        clutter_per_image: false detections expected an image, > 0.
+    """
+    seen = np.asarray(p_detect, dtype=np.float64) * np.asarray(visible_fraction, dtype=np.float64)
+    each = np.asarray(box_log_ratios, dtype=np.float64) + np.asarray(class_log_ratios, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        found = np.log(seen) + log_sum(each) - np.log(clutter_per_image)
+        return np.logaddexp(np.log1p(-seen), found)
+
+
+def box_iou(a: ArrayLike, b: ArrayLike) -> Array:
+    """Intersection over union (...) of boxes (..., 4), COCO xywh; 0 where both are empty."""
+    intersection, area_a, area_b = _overlap(a, b)
+    union = area_a + area_b - intersection
+    return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)
+
+
+def box_overlap_min(a: ArrayLike, b: ArrayLike) -> Array:
+    """The paper's l: intersection over the smaller area (...) of boxes (..., 4), COCO xywh; 0 where one is empty."""
+    intersection, area_a, area_b = _overlap(a, b)
+    smaller = np.minimum(area_a, area_b)
+    return np.where(smaller > 0, intersection / np.where(smaller > 0, smaller, 1.0), 0.0)
+
+
+def _overlap(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array, Array]:
+    p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    low = np.maximum(p[..., :2], q[..., :2])
+    high = np.minimum(p[..., :2] + p[..., 2:], q[..., :2] + q[..., 2:])
+    return np.prod(np.maximum(high - low, 0.0), axis=-1), np.prod(p[..., 2:], axis=-1), np.prod(q[..., 2:], axis=-1)
+
+
+def box_log_ratio(
+    box_detected: ArrayLike, box_rendered: ArrayLike, sigma_rel: float, image_size: tuple[float, float]
+) -> Array:
+    """log[l(detected | rendered) / u]: heavy-tailed around the rendered edges, against any box of the image.
+
+    Each edge has a Laplace density with standard deviation `sigma_rel` of the rendered box's width (left and right
+    edges) or height (top and bottom), at least a pixel. A false alarm's box has two corners anywhere: u = 4 / (W H)^2.
+
+    Args:
+        box_detected: (..., 4) COCO xywh, pixels.
+        box_rendered: (..., 4) box of the rendered pixels that are visible; one without area gives -inf.
+        sigma_rel: of a detector's edges, relative to the box.
+        image_size: width, height in pixels.
+    """
+    found, drawn = np.asarray(box_detected, dtype=np.float64), np.asarray(box_rendered, dtype=np.float64)
+    scale = np.maximum(sigma_rel * drawn[..., 2:], 1.0) / np.sqrt(2.0)
+    miss_low = np.abs(found[..., :2] - drawn[..., :2])
+    miss_high = np.abs(found[..., :2] + found[..., 2:] - drawn[..., :2] - drawn[..., 2:])
+    log_density = (-2.0 * np.log(2.0 * scale) - (miss_low + miss_high) / scale).sum(axis=-1)
+    log_clutter = np.log(4.0) - 2.0 * np.log(image_size[0] * image_size[1])
+    return np.where((drawn[..., 2:] > 0).all(axis=-1), log_density - log_clutter, -np.inf)
+
+
+def class_log_ratio(scores: ArrayLike, class_prior: ArrayLike | None = None, floor: float = 0.05) -> Array:
+    """log[p(s | c) / p(s | clutter)] from a detector's belief s over background and classes.
+
+    By Bayes p(s | c) is proportional to s_c / prior_c. A score of exactly 0 is a rounding, not a certainty: the belief
+    is mixed with the prior, which bounds the ratio.
+
+    Args:
+        scores: (..., C + 1) background first; sums to 1.
+        class_prior: (C + 1,) belief that the detector was trained with; None = uniform.
+        floor: weight of the prior in the mix.
+
+    Returns:
+        (..., C) nats; uniform scores give 0.
+    """
+    s = np.asarray(scores, dtype=np.float64)
+    prior = np.full(s.shape[-1], 1.0 / s.shape[-1]) if class_prior is None else np.asarray(class_prior, np.float64)
+    log_likelihood = np.log((1.0 - floor) * s / prior + floor)
+    return log_likelihood[..., 1:] - log_likelihood[..., :1]
+
+
+def confusion(classes: int, p_right: float) -> Array:
+    """(C, C) log pi(d | c): the detector's persistent belief is right with p_right, else any other class."""
+    wrong = (1.0 - p_right) / max(classes - 1, 1)
+    with np.errstate(divide="ignore"):
+        return np.log(np.where(np.eye(classes, dtype=bool), p_right if classes > 1 else 1.0, wrong))
+
+
+def persistent_class_log_evidence(belief_log_likelihoods: ArrayLike, log_confusion: ArrayLike) -> Array:
+    """The log of sum_d pi(d | c) prod_t p(s_t | d): what a visit's detections say about the class, together.
+
+    Args:
+        belief_log_likelihoods: (..., D) sum over the visit's detections of log p(s_t | d), up to a constant.
+        log_confusion: (C, D) log pi(d | c); its rows sum to one.
+
+    Returns:
+        (..., C) nats. Classes differ by no more than the largest log ratio within a column of pi.
+    """
+    return log_sum(np.asarray(belief_log_likelihoods, dtype=np.float64)[..., None, :] + np.asarray(log_confusion))
+
+
+def paper_log_similarity(squared_difference_sum: ArrayLike, lambda_per_m2: float) -> Array:
+    """The literal log f = -lambda SSD (Equation 6), of sums (...) of squared depth differences, m^2."""
+    return -lambda_per_m2 * np.asarray(squared_difference_sum, dtype=np.float64)
+
+
+def paper_log_potential(
+    class_scores: ArrayLike, overlaps: ArrayLike, log_similarity: ArrayLike, in_view: ArrayLike, delta: float
+) -> Array:
+    """The literal log phi_m: delta out of view; f alone where nothing is detected; else g = sum_k h l f.
+
+    Args:
+        class_scores: (..., K) h, each detection's score of the object's class; K = 0 where nothing is detected.
+        overlaps: (..., K) l from `box_overlap_min`.
+        log_similarity: (...) from `paper_log_similarity`.
+        in_view: (...) whether the object is in the field of view.
+        delta: the constant for objects that aren't, > 0.
+    """
+    h, overlap = np.asarray(class_scores, dtype=np.float64), np.asarray(overlaps, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        matched = np.log((h * overlap).sum(axis=-1)) if h.shape[-1] else np.zeros(h.shape[:-1])
+    return np.where(in_view, matched + np.asarray(log_similarity, dtype=np.float64), np.log(delta))
+
+
+def mode_residual(
+    T_world_camera: ArrayLike,
+    T_world_object: ArrayLike,
+    T_camera_mode: ArrayLike,
+    bias: ArrayLike | None = None,
+    symmetry: Symmetry = NONE,
+    information: ArrayLike | None = None,
+) -> Array:
+    """A measurement mode as the graph holds it: r = log(T_camera_mode^-1 T_world_camera^-1 T_world_object g) - b.
+
+    Args:
+        T_world_camera: (..., 4, 4).
+        T_world_object: (..., 4, 4).
+        T_camera_mode: (..., 4, 4) the object's pose in the camera's frame where the score has a mode.
+        bias: (..., 6) error of the visit in the object's tangent, None = 0. Modes that share one must be
+            written in the same of the object's equivalent poses: `symmetry.nearest_image`.
+        symmetry: g of it is the one that makes r shortest.
+        information: (..., 6, 6) of the mode, to choose g by; None = by angle.
+
+    Returns:
+        (..., 6) in the object's tangent; free directions carry nothing, see `Symmetry.projection`.
+    """
+    seen = se3.inverse(np.asarray(T_world_camera, dtype=np.float64)) @ np.asarray(T_world_object, dtype=np.float64)
+    r = residual(T_camera_mode, seen, symmetry, information)
+    return r if bias is None else r - np.asarray(bias, dtype=np.float64)
+
+
+def mode_residual_jacobians(
+    T_world_camera: ArrayLike,
+    T_world_object: ArrayLike,
+    T_camera_mode: ArrayLike,
+    bias: ArrayLike | None = None,
+    symmetry: Symmetry = NONE,
+    information: ArrayLike | None = None,
+) -> tuple[Array, Array, Array]:
+    """`mode_residual` (..., 6) and its derivatives (..., 6, 6) by right perturbations of camera and object.
+
+    The derivative by the bias is minus the identity.
+    """
+    camera, placed = np.asarray(T_world_camera, dtype=np.float64), np.asarray(T_world_object, dtype=np.float64)
+    r, _, J_object = residual_jacobians(T_camera_mode, se3.inverse(camera) @ placed, symmetry, information)
+    J_camera = -J_object @ se3.adjoint(se3.inverse(placed) @ camera)
+    return (r if bias is None else r - np.asarray(bias, dtype=np.float64)), J_camera, J_object
+
+
+def mode_log_potential(
+    T_world_camera: ArrayLike,
+    T_world_object: ArrayLike,
+    T_camera_mode: ArrayLike,
+    information: ArrayLike,
+    bias: ArrayLike | None = None,
+    symmetry: Symmetry = NONE,
+) -> Array:
+    """-1/2 r^T L r + 1/2 log det(L / 2 pi) in nats (...), for a mode's information L (..., 6, 6); see `mode_residual`.
+
+    A direction in which L is flat makes it -inf: give such a direction the weak information of its stated interval.
+    """
+    r = mode_residual(T_world_camera, T_world_object, T_camera_mode, bias, symmetry, information)
+    reduced = (symmetry.projection @ r[..., None])[..., 0]
+    return gaussian_log_density(reduced, symmetry.reduced_information(information))

@@ -1,0 +1,214 @@
+"""The context potential phi_c = w1 phi_cat + w2 phi_ins: what stands beside what, and on what (Equation 5).
+
+phi_c multiplies into the posterior only as a ratio to how pairs are placed when nothing relates them, so that two
+strangers contribute log 1 = 0, and so does a missing neighbour:
+
+    log [ (w1 phi_cat + w2 phi_ins) / phi_background ]                     w1 = w2 = 0.5 in the paper
+
+A Gaussian as a potential of its own, without the ratio, would pay an object for having neighbours (or charge it), by an
+amount that depends on its unit.
+
+**Category level.** A related pair is, with probability `strength`, placed together: its distance d has a Gaussian
+around a usual distance m, normalised as a density over the plane on which things stand; otherwise it is placed as
+strangers are, uniformly over the place's area A:
+
+    phi_cat / phi_background = (1 - strength) + strength A exp(-(d - m)^2 / 2 s^2) / Z(m, s)
+
+Pairs of one category are related, and so are the class pairs of a table (a mouse beside a keyboard).
+
+**Instance level.** phi_ins / phi_background is learned from other visits and comes in as a number; it is 1 until
+something is known.
+
+**Physics.** Penetration and floating are matters of possibility, not of likelihood: they are hinges outside the
+mixture, -1/2 (max(0, excess) / sigma)^2, so that no weight w1 can buy them off.
+
+The paper multiplies phi_c in at every time step, which raises a prior to the number of frames. A pair is one fact for
+as long as it stands still: each of its n keyframes gets 1/n of it (`per_keyframe`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf
+
+from sequences import se3
+from sequences.options import option
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Relation:
+    """How strongly two classes belong together, and how far apart they then stand."""
+
+    strength: float = option(0.3, "probability that a pair is placed together rather than anywhere", low=0.0, high=1.0)
+    distance_m: float = option(0.0, "usual distance between their centres, metres", low=0.0)
+    sigma_m: float = option(0.25, "standard deviation of that distance, metres", low=1e-3)
+
+
+@dataclass(frozen=True)
+class CategoryRelations:
+    """The category-level prior, encoded by hand as in the paper."""
+
+    same_category: Relation = Relation()
+    """pairs of classes that share a category"""
+    pairs: tuple[tuple[str, str, Relation], ...] = ()
+    """class or category names in either order, and how they are related; class names go before categories"""
+    area_m2: float = option(4.0, "area over which unrelated things are spread, square metres", low=1e-3)
+    category_weight: float = option(0.5, "w1 of the paper; w2 is the rest", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RelationTable:
+    """`CategoryRelations` looked up for every pair of classes, as arrays to index with class positions."""
+
+    strength: Array
+    """(C, C)"""
+    distance_m: Array
+    """(C, C)"""
+    sigma_m: Array
+    """(C, C)"""
+
+
+def relation_table(names: list[str], categories: list[str], relations: CategoryRelations) -> RelationTable:
+    """The table of C classes with their names and categories; an empty category has no kin."""
+    rows = [
+        [_related(a, b, relations) for b in zip(names, categories, strict=True)]
+        for a in zip(names, categories, strict=True)
+    ]
+    values = np.array([[(r.strength, r.distance_m, r.sigma_m) for r in row] for row in rows]).reshape(-1, len(names), 3)
+    return RelationTable(values[..., 0], values[..., 1], values[..., 2])
+
+
+def _related(a: tuple[str, str], b: tuple[str, str], relations: CategoryRelations) -> Relation:
+    named = {frozenset(pair[:2]): pair[2] for pair in relations.pairs}
+    for x, y in ((a[0], b[0]), (a[0], b[1]), (a[1], b[0]), (a[1], b[1])):
+        if frozenset((x, y)) in named:
+            return named[frozenset((x, y))]
+    return relations.same_category if a[1] and a[1] == b[1] else Relation(strength=0.0)
+
+
+def pair_distance(T_a: ArrayLike, T_b: ArrayLike, centre_a: ArrayLike, centre_b: ArrayLike) -> Array:
+    """Distance (...) in metres between the centres (..., 3), object frames, of objects at T_a and T_b (..., 4, 4)."""
+    return pair_distance_jacobians(T_a, T_b, centre_a, centre_b)[0]
+
+
+def pair_distance_jacobians(
+    T_a: ArrayLike, T_b: ArrayLike, centre_a: ArrayLike, centre_b: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """`pair_distance` (...) and its gradients (..., 6) for right perturbations of T_a and of T_b.
+
+    Where the centres coincide the distance has a kink; the gradients are 0 there.
+    """
+    A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
+    a, b = np.asarray(centre_a, dtype=np.float64), np.asarray(centre_b, dtype=np.float64)
+    apart = se3.transform(B, b[..., None, :])[..., 0, :] - se3.transform(A, a[..., None, :])[..., 0, :]
+    distance = np.linalg.norm(apart, axis=-1)
+    direction = apart / np.where(distance > 0, distance, 1.0)[..., None]
+    return distance, -_along(A, a, direction), _along(B, b, direction)
+
+
+def _along(T: Array, point: Array, direction: Array) -> Array:
+    """How fast T exp(xi) point moves along a world direction: the gradient (..., 6) by xi."""
+    local = (np.swapaxes(T[..., :3, :3], -1, -2) @ direction[..., None])[..., 0]
+    return np.concatenate([np.cross(point, local), local], axis=-1)
+
+
+def category_log_ratio(
+    distance_m: ArrayLike, strength: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike, area_m2: float
+) -> Array:
+    """log(phi_cat / phi_background) of pairs at a distance; see the module's text.
+
+    Args:
+        distance_m: (...) between the pair's centres.
+        strength: (...) from `RelationTable`, as are the next two.
+        usual_m: (...).
+        sigma_m: (...).
+        area_m2: of the place.
+
+    Returns:
+        (...) nats; 0 for unrelated pairs. `context_residual` has the derivative.
+    """
+    share, together = _mixture(strength, usual_m, sigma_m, area_m2)
+    x = _whitened(distance_m, usual_m, sigma_m)
+    with np.errstate(divide="ignore"):
+        return np.logaddexp(np.log(share), np.log(together) - 0.5 * x * x)
+
+
+def context_log_ratio(category: ArrayLike, instance: ArrayLike = 0.0, category_weight: float = 0.5) -> Array:
+    """log[(w1 phi_cat + w2 phi_ins) / phi_background] from the two log ratios (...), nats.
+
+    `instance` is 0 while nothing is known of the pair in this place. A pair without a neighbour isn't there to be
+    summed.
+    """
+    with np.errstate(divide="ignore"):
+        weights = np.log([category_weight, 1.0 - category_weight])
+    return np.logaddexp(weights[0] + np.asarray(category), weights[1] + np.asarray(instance))
+
+
+def context_residual(
+    distance_m: ArrayLike,
+    strength: ArrayLike,
+    usual_m: ArrayLike,
+    sigma_m: ArrayLike,
+    area_m2: float,
+    instance: ArrayLike = 0.0,
+    category_weight: float = 0.5,
+) -> tuple[Array, Array, Array]:
+    """The context of a pair as a least-squares residual in its distance: context_log_ratio = peak - 1/2 e^2.
+
+    The energy of a mixture has one minimum in d, at the usual distance; its signed square root, negative nearer and
+    positive farther, is smooth there, where the square root alone would have a kink.
+
+    Returns:
+        e (...), its derivative by the distance (...), and the peak (...) in nats, the constant that e leaves out.
+    """
+    share, together = _mixture(strength, usual_m, sigma_m, area_m2)
+    base = category_weight * share + (1.0 - category_weight) * np.exp(np.asarray(instance, dtype=np.float64))
+    high = category_weight * together
+    x = _whitened(distance_m, usual_m, sigma_m)
+    bell = np.exp(-0.5 * x * x)
+    now = base + high * bell
+    e = np.sign(x) * np.sqrt(2.0 * np.log1p(-high * np.expm1(-0.5 * x * x) / now))
+    # d(e^2 / 2) = e de; where e vanishes its slope is the root of the curvature
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.where(np.abs(x) < 1e-6, np.sqrt(high / (base + high)), high * bell * x / (now * e))
+    slope = np.where(high > 0, slope, 0.0) / np.asarray(sigma_m, dtype=np.float64)
+    return e, slope, np.log(base + high)
+
+
+def _whitened(distance_m: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike) -> Array:
+    d, m, s = (np.asarray(value, dtype=np.float64) for value in (distance_m, usual_m, sigma_m))
+    return (d - m) / s
+
+
+def _mixture(strength: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike, area_m2: float) -> tuple[Array, Array]:
+    """The two terms of phi_cat / phi_background: strangers, and the pair's at its usual distance."""
+    s, m = np.asarray(sigma_m, dtype=np.float64), np.asarray(usual_m, dtype=np.float64)
+    strong = np.asarray(strength, dtype=np.float64)
+    # integral of exp(-(d - m)^2 / 2 s^2) over the plane, in polar coordinates
+    bell = np.exp(-0.5 * (m / s) ** 2)
+    plane = 2.0 * np.pi * (s * s * bell + m * s * np.sqrt(0.5 * np.pi) * (1.0 + erf(m / (s * np.sqrt(2.0)))))
+    return 1.0 - strong, strong * area_m2 / plane
+
+
+def hinge_residual(excess_m: ArrayLike, sigma_m: ArrayLike) -> tuple[Array, Array]:
+    """max(0, excess) / sigma (...) and its derivative by the excess (...): the residual of `hinge_log_potential`.
+
+    The excess is how deep two objects intersect, or how high one floats above what carries it; below 0 all is well.
+    """
+    excess, sigma = np.broadcast_arrays(np.asarray(excess_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64))
+    return np.maximum(excess, 0.0) / sigma, np.where(excess > 0.0, 1.0 / sigma, 0.0)
+
+
+def hinge_log_potential(excess_m: ArrayLike, sigma_m: ArrayLike) -> Array:
+    """-1/2 (max(0, excess) / sigma)^2 (...) nats, of a penetration depth or a gap to the support, metres."""
+    return -0.5 * hinge_residual(excess_m, sigma_m)[0] ** 2
+
+
+def per_keyframe(log_ratio: ArrayLike, keyframes: ArrayLike) -> Array:
+    """The share log_ratio / n of each of the n keyframes over which a pair stands; a residual's is e / sqrt(n)."""
+    return np.asarray(log_ratio, dtype=np.float64) / np.asarray(keyframes, dtype=np.float64)

@@ -1,0 +1,248 @@
+"""Residuals of objects that look the same from several poses.
+
+An object's symmetries form a group G of motions g with "T g looks like T". What can be known is the coset T G, so the
+residual between two poses is the shortest one between their cosets:
+
+    r(T_a, T_b) = log(T_a^-1 T_b g*),     g* = argmin_g of its length
+
+A discrete group is the best of |S| residuals. A rotation about a line (axis u through point p) is removed in closed
+form: the swing-twist decomposition R = swing . twist(u) has a swing with no component along u, and it is the smallest
+rotation on the coset. Residual, Jacobian and degrees of freedom then lose that direction, and densities are over the
+quotient SE(3)/G: a uniform pose has density |S| / (8 pi^2 V), and 1 / (4 pi V) with one free axis (8 pi^2 / 2 pi).
+
+Every compact group of motions has a fixed point. About that centre all symmetries are pure rotations; a covariance that
+is isotropic there is invariant under G, so that energies don't depend on which of the equivalent poses an object is
+written in. Tangents are those of the object frame: [rotation, translation], right perturbation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.mixture import LOG_2PI, LOG_ROTATIONS, squared_distance
+from sequences import se3
+from sequences.catalogue import ObjectClass
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def _identity() -> Array:
+    return np.eye(4)[None]
+
+
+def _no_axes() -> Array:
+    return np.zeros((0, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """The symmetries of one object, in its own frame."""
+
+    discrete: Array = field(default_factory=_identity)
+    """(S, 4, 4) metres, identity first"""
+    axes: Array = field(default_factory=_no_axes)
+    """(A, 3) unit vectors: any rotation about these lines leaves the object as it is"""
+    offsets: Array = field(default_factory=_no_axes)
+    """(A, 3) a point on each line, metres"""
+
+    @classmethod
+    def of(cls, object_class: ObjectClass) -> Symmetry:
+        """The symmetries that a catalogue gives a class."""
+        lines = object_class.symmetries_continuous
+        return cls(
+            discrete=np.asarray(object_class.symmetries_discrete, dtype=np.float64).reshape(-1, 4, 4),
+            axes=np.array([line.axis for line in lines], dtype=np.float64).reshape(-1, 3),
+            offsets=np.array([line.offset for line in lines], dtype=np.float64).reshape(-1, 3),
+        )
+
+    @cached_property
+    def centre(self) -> Array:
+        """(3,) the fixed point of all symmetries that lies nearest to the object's origin, metres."""
+        rotations, shifts = self.discrete[:, :3, :3], self.discrete[:, :3, 3]
+        across = np.eye(3) - self.axes[:, :, None] * self.axes[:, None, :]
+        rows = np.concatenate([(rotations - np.eye(3)).reshape(-1, 3), across.reshape(-1, 3)])
+        right = np.concatenate([-shifts.ravel(), (across @ self.offsets[:, :, None]).ravel()])
+        return np.linalg.lstsq(rows, right, rcond=1e-6)[0]
+
+    @cached_property
+    def T_object_centre(self) -> Array:
+        """(4, 4) the object's axes moved to the centre."""
+        return se3.make(np.eye(3), self.centre)
+
+    @cached_property
+    def _free_rotations(self) -> Array:
+        """(3, f) orthonormal rotation axes about the centre that change nothing: none, one, or all (a ball)."""
+        if len(self.axes) == 0:
+            return np.zeros((3, 0))
+        parallel = np.abs(self.axes @ self.axes[0]) > 1.0 - 1e-6
+        return self.axes[:1].T / np.linalg.norm(self.axes[0]) if parallel.all() else np.eye(3)
+
+    @property
+    def free(self) -> int:
+        """How many directions of the pose have no meaning: 0, 1 or 3."""
+        return self._free_rotations.shape[1]
+
+    @property
+    def order(self) -> int:
+        """|S|, how many discrete images there are."""
+        return len(self.discrete)
+
+    @cached_property
+    def generators(self) -> Array:
+        """(6, f) tangents of the object frame along which it looks the same: [u, p x u]."""
+        u = self._free_rotations
+        return np.concatenate([u, np.cross(self.centre, u, axisb=0, axisc=0)]) if self.free else np.zeros((6, 0))
+
+    @cached_property
+    def free_axes(self) -> Array:
+        """(6, f) orthonormal columns that span `generators`."""
+        return np.linalg.qr(self.generators)[0]
+
+    @cached_property
+    def reader(self) -> Array:
+        """(f, 6): a tangent -> its rotation along the free directions."""
+        return np.concatenate([self._free_rotations, np.zeros((3, self.free))]).T
+
+    @cached_property
+    def lift(self) -> Array:
+        """(6, 6 - f): reduced coordinates of a residual -> the residual."""
+        basis = np.zeros((6, 6 - self.free))
+        basis[:3, :-3] = _complement(self._free_rotations)
+        basis[3:, -3:] = np.eye(3)
+        return se3.adjoint(self.T_object_centre) @ basis
+
+    @cached_property
+    def projection(self) -> Array:
+        """(6 - f, 6): a residual -> its reduced coordinates; `projection @ lift` is the identity."""
+        to_centre = se3.adjoint(se3.inverse(self.T_object_centre))
+        return np.linalg.pinv(to_centre @ self.lift) @ to_centre
+
+    def reduced_covariance(self, covariance: ArrayLike) -> Array:
+        """(..., 6, 6) of the object's tangent -> (..., 6 - f, 6 - f) of the reduced coordinates."""
+        return self.projection @ np.asarray(covariance, dtype=np.float64) @ self.projection.T
+
+    def reduced_information(self, information: ArrayLike) -> Array:
+        """(..., 6, 6) of the object's tangent -> (..., 6 - f, 6 - f) of the reduced coordinates."""
+        return self.lift.T @ np.asarray(information, dtype=np.float64) @ self.lift
+
+    @property
+    def log_quotient_rotations(self) -> float:
+        """The log of the volume of SO(3)/G: 8 pi^2 / |S|, 1/2 pi of that for a free axis, 1 for a ball."""
+        if self.free == 3:
+            return 0.0
+        return LOG_ROTATIONS - self.free * LOG_2PI - float(np.log(self.order))
+
+
+def _complement(directions: Array) -> Array:
+    """Orthonormal columns (n, n - f) that span what `directions` (n, f), orthonormal, leave."""
+    full = np.linalg.qr(np.concatenate([directions, np.eye(len(directions))], axis=1))[0]
+    return np.eye(len(directions)) if directions.shape[1] == 0 else full[:, directions.shape[1] :]
+
+
+NONE = Symmetry()
+
+
+def residual(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, information: ArrayLike | None = None) -> Array:
+    """The shortest log(T_a^-1 T_b g) over the symmetries g.
+
+    Args:
+        T_a: (..., 4, 4), broadcasts against `T_b`.
+        T_b: (..., 4, 4).
+        symmetry: of the object that both poses belong to.
+        information: (..., 6, 6) of the object's tangent, to choose g by r^T L r; None = by the angle of rotation.
+
+    Returns:
+        (..., 6) in the object's tangent. Free directions carry nothing: see `Symmetry.projection`.
+    """
+    return _shortest(T_a, T_b, symmetry, information)[0]
+
+
+def residual_jacobians(
+    T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, information: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
+    """`residual` with its derivatives with respect to right perturbations of both poses.
+
+    With r the chosen residual, d r = J_r^-1(r) (Ad(g^-1) d_b) - J_l^-1(r) d_a. The twist moves with both, which takes
+    the free direction out of either by an oblique projection along J_r^-1(r) times the generator.
+
+    Returns:
+        r (..., 6), d r / d T_a (..., 6, 6), d r / d T_b (..., 6, 6).
+    """
+    r, g = _shortest(T_a, T_b, symmetry, information)
+    right, left = se3.right_jacobian_inverse(r), se3.right_jacobian_inverse(-r)
+    if symmetry.free:
+        into_free = symmetry.generators
+        reader = symmetry.reader
+        along = right @ into_free
+        oblique = np.eye(6) - along @ np.linalg.pinv(reader @ along) @ reader
+        right, left = oblique @ right, oblique @ left
+    return r, -left, right @ se3.adjoint(se3.inverse(g))
+
+
+def best_symmetry(T_a: ArrayLike, T_b: ArrayLike, discrete: ArrayLike, information: ArrayLike | None = None) -> Ints:
+    """Which discrete symmetry s makes log(T_a^-1 T_b s) shortest: (..., 4, 4), (..., 4, 4), (S, 4, 4) -> (...).
+
+    `information` as in `residual`.
+    """
+    candidates, _ = _candidates(T_a, T_b, Symmetry(discrete=np.asarray(discrete, dtype=np.float64)))
+    return _choose(candidates, information)
+
+
+def nearest_image(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry) -> Array:
+    """T_b g, the pose (..., 4, 4) that looks like T_b and lies nearest to T_a."""
+    return np.asarray(T_b, dtype=np.float64) @ _shortest(T_a, T_b, symmetry, None)[1]
+
+
+def gauge_residual(T_reference: ArrayLike, T: ArrayLike, symmetry: Symmetry) -> tuple[Array, Array]:
+    """What holds a free direction in place, so that elimination has something to divide by.
+
+    Divide it by a weak sigma of pi: it says nothing, and the direction is to be reported as free.
+
+    Returns:
+        (..., f) the free rotation's part of log(T_reference^-1 T), rad, and its Jacobian (..., f, 6) with respect to T.
+    """
+    r = se3.local(np.asarray(T_reference, dtype=np.float64), np.asarray(T, dtype=np.float64))
+    return (symmetry.reader @ r[..., None])[..., 0], symmetry.reader @ se3.right_jacobian_inverse(r)
+
+
+def _candidates(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry) -> tuple[Array, Array]:
+    """Residuals (..., S, 6) to every discrete image, twist removed, and their g (..., S, 4, 4)."""
+    A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
+    relative = (se3.inverse(A) @ B)[..., None, :, :]
+    g = np.broadcast_to(symmetry.discrete, (*relative.shape[:-3], symmetry.order, 4, 4))
+    if symmetry.free:
+        twist = se3.make(_untwist((relative @ g)[..., :3, :3], symmetry._free_rotations), np.zeros(3))
+        g = g @ (symmetry.T_object_centre @ twist @ se3.inverse(symmetry.T_object_centre))
+    return se3.log(relative @ g), g
+
+
+def _untwist(R: Array, free: Array) -> Array:
+    """The rotation U (..., 3, 3) about the free axes for which R U has no part along them."""
+    if free.shape[1] == 3:
+        return np.swapaxes(R, -1, -2)
+    axis, q = free[:, 0], se3.quaternion(R)
+    angle = -2.0 * np.arctan2(q[..., :3] @ axis, q[..., 3])
+    return se3.so3_exp(angle[..., None] * axis)
+
+
+def _choose(candidates: Array, information: ArrayLike | None) -> Ints:
+    if information is None:
+        lengths = (candidates[..., :3] ** 2).sum(axis=-1)
+    else:
+        lengths = squared_distance(candidates, np.asarray(information, dtype=np.float64)[..., None, :, :])
+    return np.argmin(lengths, axis=-1)
+
+
+def _shortest(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry, information: ArrayLike | None) -> tuple[Array, Array]:
+    """The residual (..., 6) and the g (..., 4, 4) that gives it."""
+    candidates, g = _candidates(T_a, T_b, symmetry)
+    best = _choose(candidates, information)[..., None]
+    return (
+        np.take_along_axis(candidates, best[..., None], axis=-2)[..., 0, :],
+        np.take_along_axis(g, best[..., None, None], axis=-3)[..., 0, :, :],
+    )
