@@ -1,9 +1,11 @@
-"""Files are written whole or not at all: beside the target first, then renamed over it."""
+"""Files and folders are written whole or not at all: beside the target first, then renamed over it."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,36 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """JSON with indent 1; NaN and infinity are refused (ValueError), since JSON has none."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def replace_folder(new: Path, target: Path) -> None:
+    """Put the folder `new` in the place of the folder `target`, which is deleted if it is there.
+
+    Linux and macOS exchange the two in one step. Elsewhere a process killed between two renames leaves the old folder
+    whole, but beside the target under a hidden name. Raises OSError.
+    """
+    if not target.exists() or not any(target.iterdir()):
+        new.replace(target)
+    elif _exchange(new, target):
+        shutil.rmtree(new)
+    else:
+        old = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.old-"))
+        target.replace(old)
+        new.replace(target)
+        shutil.rmtree(old)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Swap the names of two folders in one step; False where the system can't."""
+    if os.name != "posix":
+        return False
+    here, swap = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux; RENAME_SWAP of macOS is 2 as well
+    library = ctypes.CDLL(None)
+    if hasattr(library, "renameat2"):
+        return bool(library.renameat2(here, os.fsencode(a), here, os.fsencode(b), swap) == 0)
+    if hasattr(library, "renamex_np"):
+        return bool(library.renamex_np(os.fsencode(a), os.fsencode(b), swap) == 0)
+    return False
 
 
 def _umask() -> int:

@@ -1,6 +1,7 @@
 """Image files: what a header says, and pixels that are whole or refused.
 
-Pillow decodes them, since it raises on a truncated PNG or JPEG where OpenCV hands back the rows that it has.
+Pillow decodes them, since it raises on a truncated PNG or JPEG where OpenCV hands back the rows that it has. A damaged
+PNG may still decode, to other pixels: the checksums of its chunks are what tells.
 """
 
 from __future__ import annotations
@@ -92,9 +93,11 @@ def _header(path: Path) -> tuple[Size, str]:
 def _decode(path: Path, size: Size) -> Image.Image:
     check_size(path, image_size(path), size, "the camera")
     try:
-        with Image.open(path) as image:
-            image.load()
-            return image.copy()
+        data = path.read_bytes()
+        Image.open(io.BytesIO(data)).verify()
+        image = Image.open(io.BytesIO(data))
+        image.load()
+        return image
     except (OSError, SyntaxError, ValueError) as error:
         raise _damaged(path, error) from error
 

@@ -39,7 +39,7 @@ def load_truth(run: Run) -> Truth | None:
 
     - `inst_id` says which physical object an entry is, over all visits. In a visit without inst_id the k-th entry of an
       obj_id is taken to be one object in all frames of that visit, and another in each other visit.
-    - scene_camera_gt.json holds the true camera poses in the visit's frame; where it is missing the recorded ones count.
+    - scene_camera_gt.json holds the true camera poses in the visit's frame; without it the recorded ones count.
     - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing.
 
     Raises:

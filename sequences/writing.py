@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sequences import layout, se3
-from sequences.atomic import write_bytes, write_json
+from sequences.atomic import replace_folder, write_json
 from sequences.camera import Camera
 from sequences.catalogue import Catalogue, ObjectClass
 from sequences.errors import InputError
@@ -107,7 +107,8 @@ class RunWriter:
         try:
             if kind is None:
                 self._finish()
-                self._put_in_place()
+                self._check_target()
+                replace_folder(self._folder, self._target)
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -147,7 +148,7 @@ class RunWriter:
         write_json(self._folder / layout.CAMERA, _camera_json(cameras[0], self._depth_scale))
         models = self._folder / layout.MODELS
         for one in self._catalogue.classes:
-            write_bytes(models / layout.mesh_name(one.obj_id), encode_mesh(one.mesh))
+            _write(models / layout.mesh_name(one.obj_id), encode_mesh(one.mesh))
         write_json(models / layout.MODELS_INFO, {str(c.obj_id): _model_json(c) for c in self._catalogue.classes})
         write_json(self._folder / layout.CATALOGUE, {str(c.obj_id): _class_json(c) for c in self._catalogue.classes})
         write_json(self._folder / layout.CTMAP, self._description())
@@ -173,16 +174,6 @@ class RunWriter:
             },
             "T_robot_camera": None if self._T_robot_camera is None else _motion_json(self._T_robot_camera),
         }
-
-    def _put_in_place(self) -> None:
-        self._check_target()
-        if not self._target.exists() or not any(self._target.iterdir()):
-            self._folder.replace(self._target)
-            return
-        old = Path(tempfile.mkdtemp(dir=self._target.parent, prefix=f".{self._target.name}.old-"))
-        self._target.replace(old)
-        self._folder.replace(self._target)
-        shutil.rmtree(old)
 
 
 @dataclass
@@ -230,9 +221,9 @@ class VisitWriter:
         self.cameras.append(camera)
         counts = np.rint(np.asarray(depth, dtype=np.float64) / (self.depth_scale * layout.MM))
         counts = np.where(counts <= _DEEPEST, counts, 0).astype(np.uint16)
-        write_bytes(self.folder / layout.DEPTH / layout.image_name(im_id), encode_png(counts))
+        _write(self.folder / layout.DEPTH / layout.image_name(im_id), encode_png(counts))
         if colour is not None:
-            write_bytes(self.folder / layout.COLOUR[0] / layout.image_name(im_id), encode_png(colour))
+            _write(self.folder / layout.COLOUR[0] / layout.image_name(im_id), encode_png(colour))
         self._frames[key] = {
             "cam_K": camera.K.ravel().tolist(),
             "depth_scale": self.depth_scale,
@@ -260,6 +251,12 @@ class VisitWriter:
             "cam_R_w2c": T_camera_visit[:3, :3].ravel().tolist(),
             "cam_t_w2c": (T_camera_visit[:3, 3] / layout.MM).tolist(),
         }
+
+
+def _write(path: Path, data: bytes) -> None:
+    # the whole folder is hidden until it is complete, so files need no care of their own
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
 
 
 def _motion_json(T: Array) -> list[float]:
