@@ -28,11 +28,13 @@ as long as it stands still: each of its n keyframes gets 1/n of it (`per_keyfram
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erf
 
 from sequences import se3
 from sequences.options import option
@@ -62,25 +64,52 @@ class CategoryRelations:
 
 
 @dataclass(frozen=True, eq=False)
-class RelationTable:
-    """`CategoryRelations` looked up for every pair of classes, as arrays to index with class positions."""
+class PairMixture:
+    """w1 phi_cat / phi_background of pairs of classes as `strangers + together exp(-(d - usual)^2 / 2 sigma^2)`.
 
-    strength: Array
-    """(C, C)"""
-    distance_m: Array
-    """(C, C)"""
+    Arrays of one shape (...), to be indexed like one: `table[classes_a, classes_b]`.
+    """
+
+    strangers: Array
+    """(...) what is left at any distance"""
+    together: Array
+    """(...) what comes on top at the usual distance"""
+    usual_m: Array
+    """(...)"""
     sigma_m: Array
-    """(C, C)"""
+    """(...)"""
+    instance_weight: float
+    """w2"""
+
+    def __getitem__(self, index: Any) -> PairMixture:
+        return PairMixture(
+            self.strangers[index], self.together[index], self.usual_m[index], self.sigma_m[index], self.instance_weight
+        )
 
 
-def relation_table(names: list[str], categories: list[str], relations: CategoryRelations) -> RelationTable:
-    """The table of C classes with their names and categories; an empty category has no kin."""
-    rows = [
-        [_related(a, b, relations) for b in zip(names, categories, strict=True)]
-        for a in zip(names, categories, strict=True)
+def pair_mixture(relation: Relation, area_m2: float, category_weight: float = 0.5) -> PairMixture:
+    """The mixture (shape ()) of one related pair in a place of some area, with w1 the category's weight."""
+    s, m = relation.sigma_m, relation.distance_m
+    # integral of exp(-(d - m)^2 / 2 s^2) over the plane, in polar coordinates
+    tail = m * s * math.sqrt(0.5 * math.pi) * (1.0 + math.erf(m / (s * math.sqrt(2.0))))
+    plane = 2.0 * math.pi * (s * s * math.exp(-0.5 * (m / s) ** 2) + tail)
+    strangers = category_weight * (1.0 - relation.strength)
+    together = category_weight * relation.strength * area_m2 / plane
+    arrays = [np.asarray(value, dtype=np.float64) for value in (strangers, together, m, s)]
+    return PairMixture(arrays[0], arrays[1], arrays[2], arrays[3], 1.0 - category_weight)
+
+
+def relation_table(names: Sequence[str], categories: Sequence[str], relations: CategoryRelations) -> PairMixture:
+    """The mixtures (C, C) of all pairs of C classes, by their names and categories; an empty category has no kin."""
+    classes = list(zip(names, categories, strict=True))
+    pairs = [
+        pair_mixture(_related(a, b, relations), relations.area_m2, relations.category_weight)
+        for a in classes
+        for b in classes
     ]
-    values = np.array([[(r.strength, r.distance_m, r.sigma_m) for r in row] for row in rows]).reshape(-1, len(names), 3)
-    return RelationTable(values[..., 0], values[..., 1], values[..., 2])
+    parts = np.array([(p.strangers, p.together, p.usual_m, p.sigma_m) for p in pairs]).reshape(len(names), -1, 4)
+    weight = 1.0 - relations.category_weight
+    return PairMixture(parts[..., 0], parts[..., 1], parts[..., 2], parts[..., 3], weight)
 
 
 def _related(a: tuple[str, str], b: tuple[str, str], relations: CategoryRelations) -> Relation:
@@ -117,82 +146,41 @@ def _along(T: Array, point: Array, direction: Array) -> Array:
     return np.concatenate([np.cross(point, local), local], axis=-1)
 
 
-def category_log_ratio(
-    distance_m: ArrayLike, strength: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike, area_m2: float
-) -> Array:
-    """log(phi_cat / phi_background) of pairs at a distance; see the module's text.
+def context_log_ratio(distance_m: ArrayLike, pair: PairMixture, instance: ArrayLike = 0.0) -> Array:
+    """The log of (w1 phi_cat + w2 phi_ins) / phi_background of pairs at a distance.
 
     Args:
         distance_m: (...) between the pair's centres.
-        strength: (...) from `RelationTable`, as are the next two.
-        usual_m: (...).
-        sigma_m: (...).
-        area_m2: of the place.
+        pair: of their classes, (...).
+        instance: (...) log(phi_ins / phi_background), nats; 0 while nothing is known of the pair in this place.
 
     Returns:
         (...) nats; 0 for unrelated pairs. `context_residual` has the derivative.
     """
-    share, together = _mixture(strength, usual_m, sigma_m, area_m2)
-    x = _whitened(distance_m, usual_m, sigma_m)
-    with np.errstate(divide="ignore"):
-        return np.logaddexp(np.log(share), np.log(together) - 0.5 * x * x)
+    x = (np.asarray(distance_m, dtype=np.float64) - pair.usual_m) / pair.sigma_m
+    base = pair.strangers + pair.instance_weight * np.exp(np.asarray(instance, dtype=np.float64))
+    return np.log(base + pair.together * np.exp(-0.5 * x * x))
 
 
-def context_log_ratio(category: ArrayLike, instance: ArrayLike = 0.0, category_weight: float = 0.5) -> Array:
-    """log[(w1 phi_cat + w2 phi_ins) / phi_background] from the two log ratios (...), nats.
+def context_residual(distance_m: ArrayLike, pair: PairMixture, instance: ArrayLike = 0.0) -> tuple[Array, Array, Array]:
+    """The context as a least-squares residual e in the distance: context_log_ratio = peak - 1/2 e^2.
 
-    `instance` is 0 while nothing is known of the pair in this place. A pair without a neighbour isn't there to be
-    summed.
-    """
-    with np.errstate(divide="ignore"):
-        weights = np.log([category_weight, 1.0 - category_weight])
-    return np.logaddexp(weights[0] + np.asarray(category), weights[1] + np.asarray(instance))
-
-
-def context_residual(
-    distance_m: ArrayLike,
-    strength: ArrayLike,
-    usual_m: ArrayLike,
-    sigma_m: ArrayLike,
-    area_m2: float,
-    instance: ArrayLike = 0.0,
-    category_weight: float = 0.5,
-) -> tuple[Array, Array, Array]:
-    """The context of a pair as a least-squares residual in its distance: context_log_ratio = peak - 1/2 e^2.
-
-    The energy of a mixture has one minimum in d, at the usual distance; its signed square root, negative nearer and
+    The energy of the mixture has one minimum in d, at the usual distance; its signed square root, negative nearer and
     positive farther, is smooth there, where the square root alone would have a kink.
 
     Returns:
         e (...), its derivative by the distance (...), and the peak (...) in nats, the constant that e leaves out.
     """
-    share, together = _mixture(strength, usual_m, sigma_m, area_m2)
-    base = category_weight * share + (1.0 - category_weight) * np.exp(np.asarray(instance, dtype=np.float64))
-    high = category_weight * together
-    x = _whitened(distance_m, usual_m, sigma_m)
+    x = (np.asarray(distance_m, dtype=np.float64) - pair.usual_m) / pair.sigma_m
+    base = pair.strangers + pair.instance_weight * np.exp(np.asarray(instance, dtype=np.float64))
+    high = pair.together
     bell = np.exp(-0.5 * x * x)
     now = base + high * bell
     e = np.sign(x) * np.sqrt(2.0 * np.log1p(-high * np.expm1(-0.5 * x * x) / now))
     # d(e^2 / 2) = e de; where e vanishes its slope is the root of the curvature
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(np.abs(x) < 1e-6, np.sqrt(high / (base + high)), high * bell * x / (now * e))
-    slope = np.where(high > 0, slope, 0.0) / np.asarray(sigma_m, dtype=np.float64)
-    return e, slope, np.log(base + high)
-
-
-def _whitened(distance_m: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike) -> Array:
-    d, m, s = (np.asarray(value, dtype=np.float64) for value in (distance_m, usual_m, sigma_m))
-    return (d - m) / s
-
-
-def _mixture(strength: ArrayLike, usual_m: ArrayLike, sigma_m: ArrayLike, area_m2: float) -> tuple[Array, Array]:
-    """The two terms of phi_cat / phi_background: strangers, and the pair's at its usual distance."""
-    s, m = np.asarray(sigma_m, dtype=np.float64), np.asarray(usual_m, dtype=np.float64)
-    strong = np.asarray(strength, dtype=np.float64)
-    # integral of exp(-(d - m)^2 / 2 s^2) over the plane, in polar coordinates
-    bell = np.exp(-0.5 * (m / s) ** 2)
-    plane = 2.0 * np.pi * (s * s * bell + m * s * np.sqrt(0.5 * np.pi) * (1.0 + erf(m / (s * np.sqrt(2.0)))))
-    return 1.0 - strong, strong * area_m2 / plane
+    flat = np.abs(x) < 1e-6
+    slope = high * bell * x / (now * np.where(flat | (e == 0), 1.0, e))
+    return e, np.where(flat, np.sqrt(high / (base + high)), slope) / pair.sigma_m, np.log(base + high)
 
 
 def hinge_residual(excess_m: ArrayLike, sigma_m: ArrayLike) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors import mixture
 from factors.mixture import squared_distance
-from factors.symmetry import NONE, Symmetry, residual, residual_jacobians
+from factors.symmetry import NONE, Symmetry, reduced_residual_jacobians, residual
 from sequences import se3
 
 Array = NDArray[np.float64]
@@ -69,24 +69,10 @@ def log_potential_jacobians(
     T_a: ArrayLike, T_b: ArrayLike, sigma: ArrayLike, symmetry: Symmetry = NONE
 ) -> tuple[Array, Array, Array]:
     """`log_potential` (...) and its gradients (..., 6) for right perturbations of T_a and of T_b."""
-    r, J_a, J_b = reduced_residual_jacobians(T_a, T_b, sigma, symmetry)
+    r, J_a, J_b = reduced_residual_jacobians(T_a, T_b, symmetry, np.linalg.inv(np.asarray(sigma, np.float64)))
     information = np.linalg.inv(symmetry.reduced_covariance(sigma))
     pull = -(information @ r[..., None])[..., 0][..., None, :]
     return mixture.gaussian_log_density(r, information), (pull @ J_a)[..., 0, :], (pull @ J_b)[..., 0, :]
-
-
-def reduced_residual_jacobians(
-    T_a: ArrayLike, T_b: ArrayLike, sigma: ArrayLike, symmetry: Symmetry = NONE
-) -> tuple[Array, Array, Array]:
-    """The residual in its 6 - f meaningful coordinates, whose covariance is `symmetry.reduced_covariance(sigma)`.
-
-    Returns:
-        r (..., 6 - f), d r / d T_a (..., 6 - f, 6), d r / d T_b (..., 6 - f, 6).
-    """
-    information = np.linalg.inv(np.asarray(sigma, dtype=np.float64))
-    r, J_a, J_b = residual_jacobians(T_a, T_b, symmetry, information)
-    P = symmetry.projection
-    return (P @ r[..., None])[..., 0], P @ J_a, P @ J_b
 
 
 def integrated_log_potential(
@@ -113,7 +99,7 @@ def integrated_log_potential(
     Returns:
         (...) nats.
     """
-    r, J_a, J_b = reduced_residual_jacobians(T_a, T_b, sigma, symmetry)
+    r, J_a, J_b = reduced_residual_jacobians(T_a, T_b, symmetry, np.linalg.inv(np.asarray(sigma, np.float64)))
     total = symmetry.reduced_covariance(sigma)
     for J, spread in ((J_a, covariance_a), (J_b, covariance_b)):
         total = total + J @ np.asarray(spread, dtype=np.float64) @ np.swapaxes(J, -1, -2)

@@ -23,7 +23,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.mixture import LOG_2PI, LOG_ROTATIONS, squared_distance
+from factors._shortest import shortest, shortest_jacobians
+from factors.mixture import LOG_2PI, LOG_ROTATIONS
 from sequences import se3
 from sequences.catalogue import ObjectClass
 
@@ -75,17 +76,17 @@ class Symmetry:
         return se3.make(np.eye(3), self.centre)
 
     @cached_property
-    def _free_rotations(self) -> Array:
+    def free_rotations(self) -> Array:
         """(3, f) orthonormal rotation axes about the centre that change nothing: none, one, or all (a ball)."""
         if len(self.axes) == 0:
             return np.zeros((3, 0))
         parallel = np.abs(self.axes @ self.axes[0]) > 1.0 - 1e-6
-        return self.axes[:1].T / np.linalg.norm(self.axes[0]) if parallel.all() else np.eye(3)
+        return np.ascontiguousarray(self.axes[:1].T) if parallel.all() else np.eye(3)
 
     @property
     def free(self) -> int:
         """How many directions of the pose have no meaning: 0, 1 or 3."""
-        return self._free_rotations.shape[1]
+        return self.free_rotations.shape[1]
 
     @property
     def order(self) -> int:
@@ -95,7 +96,7 @@ class Symmetry:
     @cached_property
     def generators(self) -> Array:
         """(6, f) tangents of the object frame along which it looks the same: [u, p x u]."""
-        u = self._free_rotations
+        u = self.free_rotations
         return np.concatenate([u, np.cross(self.centre, u, axisb=0, axisc=0)]) if self.free else np.zeros((6, 0))
 
     @cached_property
@@ -106,13 +107,13 @@ class Symmetry:
     @cached_property
     def reader(self) -> Array:
         """(f, 6): a tangent -> its rotation along the free directions."""
-        return np.concatenate([self._free_rotations, np.zeros((3, self.free))]).T
+        return np.concatenate([self.free_rotations, np.zeros((3, self.free))]).T
 
     @cached_property
     def lift(self) -> Array:
         """(6, 6 - f): reduced coordinates of a residual -> the residual."""
         basis = np.zeros((6, 6 - self.free))
-        basis[:3, :-3] = _complement(self._free_rotations)
+        basis[:3, :-3] = _complement(self.free_rotations)
         basis[3:, -3:] = np.eye(3)
         return se3.adjoint(self.T_object_centre) @ basis
 
@@ -159,7 +160,7 @@ def residual(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, informat
     Returns:
         (..., 6) in the object's tangent. Free directions carry nothing: see `Symmetry.projection`.
     """
-    return _shortest(T_a, T_b, symmetry, information)[0]
+    return _shortest(*_pairs(T_a, T_b), symmetry, information)[0]
 
 
 def residual_jacobians(
@@ -167,21 +168,29 @@ def residual_jacobians(
 ) -> tuple[Array, Array, Array]:
     """`residual` with its derivatives with respect to right perturbations of both poses.
 
-    With r the chosen residual, d r = J_r^-1(r) (Ad(g^-1) d_b) - J_l^-1(r) d_a. The twist moves with both, which takes
-    the free direction out of either by an oblique projection along J_r^-1(r) times the generator.
+    The g of a continuous symmetry moves with the poses, which takes the free direction out of both derivatives.
 
     Returns:
         r (..., 6), d r / d T_a (..., 6, 6), d r / d T_b (..., 6, 6).
     """
-    r, g = _shortest(T_a, T_b, symmetry, information)
-    right, left = se3.right_jacobian_inverse(r), se3.right_jacobian_inverse(-r)
-    if symmetry.free:
-        into_free = symmetry.generators
-        reader = symmetry.reader
-        along = right @ into_free
-        oblique = np.eye(6) - along @ np.linalg.pinv(reader @ along) @ reader
-        right, left = oblique @ right, oblique @ left
-    return r, -left, right @ se3.adjoint(se3.inverse(g))
+    A, B = _pairs(T_a, T_b)
+    r, g, _ = _shortest(A, B, symmetry, information)
+    J = np.empty((2, *r.shape, 6))
+    shortest_jacobians(
+        _flat(A), _flat(B), r.reshape(-1, 6), _flat(g), symmetry.generators, symmetry.reader, *J.reshape(2, -1, 6, 6)
+    )
+    return r, J[0], J[1]
+
+
+def reduced_residual_jacobians(
+    T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, information: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
+    """`residual_jacobians` in the 6 - f coordinates that mean something: (..., 6 - f), (..., 6 - f, 6) twice."""
+    r, J_a, J_b = residual_jacobians(T_a, T_b, symmetry, information)
+    if symmetry is NONE:
+        return r, J_a, J_b
+    P = symmetry.projection
+    return (P @ r[..., None])[..., 0], P @ J_a, P @ J_b
 
 
 def best_symmetry(T_a: ArrayLike, T_b: ArrayLike, discrete: ArrayLike, information: ArrayLike | None = None) -> Ints:
@@ -189,13 +198,14 @@ def best_symmetry(T_a: ArrayLike, T_b: ArrayLike, discrete: ArrayLike, informati
 
     `information` as in `residual`.
     """
-    candidates, _ = _candidates(T_a, T_b, Symmetry(discrete=np.asarray(discrete, dtype=np.float64)))
-    return _choose(candidates, information)
+    symmetry = Symmetry(discrete=np.asarray(discrete, dtype=np.float64))
+    return _shortest(*_pairs(T_a, T_b), symmetry, information)[2]
 
 
 def nearest_image(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry) -> Array:
     """T_b g, the pose (..., 4, 4) that looks like T_b and lies nearest to T_a."""
-    return np.asarray(T_b, dtype=np.float64) @ _shortest(T_a, T_b, symmetry, None)[1]
+    A, B = _pairs(T_a, T_b)
+    return B @ _shortest(A, B, symmetry, None)[1]
 
 
 def gauge_residual(T_reference: ArrayLike, T: ArrayLike, symmetry: Symmetry) -> tuple[Array, Array]:
@@ -206,43 +216,40 @@ def gauge_residual(T_reference: ArrayLike, T: ArrayLike, symmetry: Symmetry) -> 
     Returns:
         (..., f) the free rotation's part of log(T_reference^-1 T), rad, and its Jacobian (..., f, 6) with respect to T.
     """
-    r = se3.local(np.asarray(T_reference, dtype=np.float64), np.asarray(T, dtype=np.float64))
-    return (symmetry.reader @ r[..., None])[..., 0], symmetry.reader @ se3.right_jacobian_inverse(r)
+    r, _, J = residual_jacobians(T_reference, T)
+    return (symmetry.reader @ r[..., None])[..., 0], symmetry.reader @ J
 
 
-def _candidates(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry) -> tuple[Array, Array]:
-    """Residuals (..., S, 6) to every discrete image, twist removed, and their g (..., S, 4, 4)."""
+def _pairs(T_a: ArrayLike, T_b: ArrayLike) -> tuple[Array, Array]:
     A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
-    relative = (se3.inverse(A) @ B)[..., None, :, :]
-    g = np.broadcast_to(symmetry.discrete, (*relative.shape[:-3], symmetry.order, 4, 4))
-    if symmetry.free:
-        twist = se3.make(_untwist((relative @ g)[..., :3, :3], symmetry._free_rotations), np.zeros(3))
-        g = g @ (symmetry.T_object_centre @ twist @ se3.inverse(symmetry.T_object_centre))
-    return se3.log(relative @ g), g
+    if A.shape != B.shape:
+        A, B = np.broadcast_arrays(A, B)
+    return np.ascontiguousarray(A), np.ascontiguousarray(B)
 
 
-def _untwist(R: Array, free: Array) -> Array:
-    """The rotation U (..., 3, 3) about the free axes for which R U has no part along them."""
-    if free.shape[1] == 3:
-        return np.swapaxes(R, -1, -2)
-    axis, q = free[:, 0], se3.quaternion(R)
-    angle = -2.0 * np.arctan2(q[..., :3] @ axis, q[..., 3])
-    return se3.so3_exp(angle[..., None] * axis)
+def _flat(T: Array) -> Array:
+    return T.reshape(-1, *T.shape[-2:])
 
 
-def _choose(candidates: Array, information: ArrayLike | None) -> Ints:
-    if information is None:
-        lengths = (candidates[..., :3] ** 2).sum(axis=-1)
-    else:
-        lengths = squared_distance(candidates, np.asarray(information, dtype=np.float64)[..., None, :, :])
-    return np.argmin(lengths, axis=-1)
-
-
-def _shortest(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry, information: ArrayLike | None) -> tuple[Array, Array]:
-    """The residual (..., 6) and the g (..., 4, 4) that gives it."""
-    candidates, g = _candidates(T_a, T_b, symmetry)
-    best = _choose(candidates, information)[..., None]
-    return (
-        np.take_along_axis(candidates, best[..., None], axis=-2)[..., 0, :],
-        np.take_along_axis(g, best[..., None, None], axis=-3)[..., 0, :, :],
+def _shortest(A: Array, B: Array, symmetry: Symmetry, information: ArrayLike | None) -> tuple[Array, Array, Ints]:
+    """The residual (..., 6), the g (..., 4, 4) that gives it, and which discrete one (...) it holds."""
+    batch = A.shape[:-2]
+    metric = np.empty((0, 6, 6))
+    if information is not None:
+        metric = np.asarray(information, dtype=np.float64)
+        if metric.ndim > 2:
+            metric = np.broadcast_to(metric, (*batch, 6, 6))
+        metric = np.ascontiguousarray(metric).reshape(-1, 6, 6)
+    r, g, chosen = np.empty((*batch, 6)), np.empty((*batch, 4, 4)), np.empty(batch, dtype=np.int64)
+    shortest(
+        _flat(A),
+        _flat(B),
+        symmetry.discrete,
+        symmetry.free_rotations,
+        symmetry.centre,
+        metric,
+        r.reshape(-1, 6),
+        _flat(g),
+        chosen.reshape(-1),
     )
+    return r, g, chosen
