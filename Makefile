@@ -7,7 +7,7 @@
 PYTHON ?= $(shell tools/find-python.sh)
 BIN := .venv/bin
 # without byte code: Python writes what it needs when it is first imported, which is a small part of it
-PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check --no-input install --no-compile --constraint constraints.txt
 BENCHES := render
 
 .PHONY: demo test lint bench clean
@@ -37,11 +37,11 @@ clean:
 
 # a stamp each, so that a second run installs nothing again
 .venv/.installed-core: pyproject.toml constraints.txt | $(BIN)/pip
-	$(PIP) install --no-compile --constraint constraints.txt --editable .
+	$(INSTALL) --editable .
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed-core
-	$(PIP) install --no-compile --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	@touch $@
 
 $(BIN)/pip:

@@ -223,7 +223,7 @@ def _names(settings: Any) -> str:
 def _bounds(f: Field[Any]) -> str:
     low, high = f.metadata.get("low"), f.metadata.get("high")
     if low is not None and high is not None:
-        return f" from {low:g} to {high:g}"
+        return f", from {low:g} to {high:g}"
     if low is not None:
         return f", at least {low:g}"
     return f", at most {high:g}" if high is not None else ""

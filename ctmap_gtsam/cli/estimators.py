@@ -1,0 +1,109 @@
+"""Commands that estimate, and that compare and report estimates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ctmap_gtsam.cli.options import Assignments, ConfigFile, Out, RunFolder, Scene, Seed, settings, writable
+
+if TYPE_CHECKING:
+    from ctmap_gtsam.config import Config
+
+NoContext = Annotated[bool, typer.Option("--no-context", help="Leave the context between objects out.")]
+
+
+def filter(
+    run: RunFolder,
+    out: Out,
+    no_context: NoContext = False,
+    scene: Scene = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Filter a run: each frame's map knows the past alone. Writes DIR/filter-ct.npz (filter-t without context).
+
+    Example: `ctmap filter recordings/kitchen --out results --set keyframes.every=2`
+    """
+    _estimate("filter-t" if no_context else "filter-ct", run, scene, out, settings(config_file, assignments, seed))
+
+
+def smooth(
+    run: RunFolder,
+    out: Out,
+    no_context: NoContext = False,
+    scene: Scene = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Smooth a run: each frame's map knows the whole run. Writes DIR/smooth-ct.npz (smooth-t without context).
+
+    Example: `ctmap smooth recordings/kitchen --out results`
+    """
+    _estimate("smooth-t" if no_context else "smooth-ct", run, scene, out, settings(config_file, assignments, seed))
+
+
+def compare(
+    run: RunFolder,
+    out: Out,
+    methods: Annotated[
+        str | None, typer.Option("--methods", metavar="A,B,...", help="Only these methods.", show_default="all")
+    ] = None,
+    scene: Scene = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Run all methods on a run and hold them against the truth and each other.
+
+    Writes DIR/summary.json, DIR/report.html, DIR/estimates/ and each method's results. Methods that ran before
+    with the same settings on the same run are not run again.
+
+    Example: `ctmap compare recordings/kitchen --out results --methods filter-ct,smooth-ct --seed 1`
+    """
+    config = settings(config_file, assignments, seed)
+    names = None if methods is None else [name.strip() for name in methods.split(",")]
+    compare_and_show(run, writable(out), config, names, scene)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where `ctmap compare` wrote.", show_default=False)],
+) -> None:
+    """Write DIR/report.html again, from the estimates that `ctmap compare` left there.
+
+    Example: `ctmap report results`
+    """
+    from ctmap_gtsam.comparing import report as write_report
+
+    typer.echo(write_report(folder))
+
+
+def compare_and_show(run: Path, out: Path, config: Config, methods: list[str] | None, scene: int | None) -> None:
+    """Compare, showing progress and then the table and where the report is."""
+    from ctmap_gtsam.cli.show import show_summary
+    from ctmap_gtsam.comparing import REPORT, SUMMARY, compare_run
+    from ctmap_gtsam.runtime.progress import RichProgress
+
+    with RichProgress() as progress:
+        compare_run(run, out, config, methods, scene, progress)
+    show_summary(out / SUMMARY)
+    typer.echo(out / REPORT)
+
+
+def _estimate(method: str, run_path: Path, scene: int | None, out: Path, config: Config) -> None:
+    from ctmap_gtsam.cli.show import show_estimate
+    from ctmap_gtsam.methods import METHODS
+    from ctmap_gtsam.runtime.progress import RichProgress
+    from sequences.bop import load_run
+
+    run = load_run(run_path, scene=scene)
+    path = writable(out) / f"{method}.npz"
+    with RichProgress() as progress:
+        estimate = METHODS[method].run(run, config, progress)
+    estimate.save(path)
+    show_estimate(estimate, run.catalogue)
+    typer.echo(path)

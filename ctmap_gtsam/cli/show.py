@@ -1,0 +1,94 @@
+"""Results as tables on stdout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from ctmap_gtsam.estimate import Estimate
+    from sequences.catalogue import Catalogue
+    from sequences.validation import Facts, Inspection
+
+
+def show_inspection(inspection: Inspection) -> None:
+    """What is there, then every problem."""
+    if inspection.facts is not None:
+        _show_facts(inspection.facts)
+    for problem in inspection.problems:
+        typer.echo(str(problem))
+    warnings = len(inspection.problems) - len(inspection.errors)
+    typer.echo(f"{len(inspection.errors)} errors, {warnings} warnings")
+
+
+def _show_facts(facts: Facts) -> None:
+    truth = f"known, {facts.true_objects} objects" if facts.has_truth else "not known"
+    up = "not given" if facts.up_world is None else " ".join(f"{x:.3f}" for x in facts.up_world)
+    noise = ", ".join(f"{name} {value:g}" for name, value in facts.localisation.items())
+    typer.echo(f"{facts.name}: {facts.frames} frames in {facts.duration_s:.1f} s; truth {truth}")
+    typer.echo(f"up in the world: {up}; localisation noise: {noise}; fingerprint {facts.fingerprint[:12]}\n")
+    _show_table(
+        ("scene", "frames", "seconds", "size", "colour", "detections"),
+        (
+            (v.scene_id, v.frames, f"{v.duration_s:.1f}", f"{v.width}x{v.height}", _yes(v.colour), v.detections)
+            for v in facts.visits
+        ),
+    )
+    _show_table(
+        ("obj_id", "class", "category", "persistence s", "diameter mm", "faces", "symmetries"),
+        (
+            (c.obj_id, c.name, c.category, f"{c.persistence_s:g}", f"{c.diameter_m * 1e3:.0f}", c.faces, c.symmetries)
+            for c in facts.classes
+        ),
+    )
+    for note in facts.derived:
+        typer.echo(f"taken for granted: {note}")
+
+
+def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:
+    """The map at the last keyframe."""
+    k = len(estimate.keyframe_frame) - 1
+    snapshot = estimate.at_keyframe(k)
+    _show_table(
+        ("object", "class", "P", "x m", "y m", "z m"),
+        (
+            (estimate.object_id[row], catalogue[int(obj_id)].name, f"{score:.3f}", *(f"{x:.3f}" for x in T[:3, 3]))
+            for row, obj_id, score, T in zip(
+                snapshot.objects, snapshot.class_id, snapshot.score, snapshot.T_world_object, strict=True
+            )
+        ),
+    )
+
+
+def show_summary(path: Path) -> None:
+    """The methods side by side, as a comparison's summary.json has them."""
+    from ctmap_gtsam.reporting.tables import COLUMNS
+
+    methods = json.loads(path.read_text())["methods"]
+    done = {name: method for name, method in methods.items() if method["status"] == "ok"}
+    _show_table(
+        ("method", *(f"{c.title} {c.unit}".rstrip() for c in COLUMNS), "seconds"),
+        (
+            (name, *(c.text(method["metrics"].get(c.key)) for c in COLUMNS), f"{method['seconds']:.1f}")
+            for name, method in done.items()
+        ),
+    )
+    for name, method in methods.items():
+        if method["status"] == "skipped":
+            typer.echo(f"{name} skipped: {method['reason']} {method['remedy']}".rstrip())
+
+
+def _show_table(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    cells = [list(columns), *(list(map(str, row)) for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    typer.echo()
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"

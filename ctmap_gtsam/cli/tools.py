@@ -1,0 +1,63 @@
+"""Commands around the estimators: the demo, the settings, measurements of speed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctmap_gtsam.cli.estimators import compare_and_show
+from ctmap_gtsam.cli.options import Assignments, ConfigFile, JsonFile, Seed, settings, writable
+from ctmap_gtsam.cli.runs import simulate_into
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the run and the results.")] = Path(
+        "ctmap-demo"
+    ),
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Simulate a small run, filter it, smooth it, compare the two and write a report.
+
+    Example: `ctmap demo --out ctmap-demo`
+    """
+    config = settings(config_file, assignments, seed)
+    run = writable(out) / "run"
+    simulate_into(run, config)
+    compare_and_show(run, out, config, methods=None, scene=None)
+
+
+def config(config_file: ConfigFile = None, assignments: Assignments = None, seed: Seed = None) -> None:
+    """Print all settings as commented TOML, ready for --config.
+
+    Example: `ctmap config --set keyframes.every=2 > settings.toml`
+    """
+    from ctmap_gtsam.runtime.settings import to_toml
+
+    typer.echo(to_toml(settings(config_file, assignments, seed)), nl=False)
+
+
+def bench(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="What to measure: render.", show_default=False)],
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Measure speed on this machine and print the figures.
+
+    Example: `ctmap bench render --json render.json`
+    """
+    from ctmap_gtsam.bench import run_bench
+    from ctmap_gtsam.runtime.progress import RichProgress
+    from sequences.atomic import write_json
+
+    with RichProgress() as progress:
+        result = run_bench(name, settings(config_file, assignments, seed), progress)
+    for figure, value in result["figures"].items():
+        typer.echo(f"{figure} {value}")
+    if json_file is not None:
+        write_json(json_file, result)
