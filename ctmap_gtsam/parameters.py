@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from factors.context import CategoryRelations
 from sequences.options import option
 
 
@@ -26,6 +27,7 @@ class Sensor:
     range_m: float = option(8.0, "the largest depth the sensor gives, metres", low=0.1)
     occluder_weight: float = option(0.15, "chance that something stands before a known background", low=0.0, high=0.9)
     background_sigma_m: float = option(0.005, "how well a background plane's depth is known, metres", low=0.0)
+    clutter_gain: float = option(2.5, "nats a sample that a surface of no known mesh would explain", low=0.0)
     kappa: float = option(0.03, "one over the number of samples whose noise is correlated", low=0.0, high=1.0)
     occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
 
@@ -37,8 +39,9 @@ class Detector:
     detection_probability: float = option(0.9, "of an object in full view", low=0.01, high=0.999)
     box_sigma: float = option(0.05, "scale of a box edge's error, as a share of the box's size", low=0.005)
     box_outlier: float = option(0.02, "share of boxes that have nothing to do with the object", low=1e-6, high=0.5)
+    clutter_rate: float = option(0.3, "chance that clutter is detected again where it was", low=0.01, high=0.99)
     confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
-    score_floor: float = option(0.005, "class scores below this are taken for this", low=1e-9, high=0.1)
+    score_floor: float = option(0.05, "weight of a uniform belief mixed into score vectors", low=1e-6, high=0.9)
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Prediction:
     rotation_rate: float = option(0.01, "random walk in view, rad per sqrt(s)", low=1e-6)
     translation_rate: float = option(0.002, "random walk in view, metres per sqrt(s)", low=1e-6)
     jump_probability: float = option(1e-4, "chance a keyframe that a pose in view is elsewhere nearby", low=0.0, high=0.5)
+    region_radius_m: float = option(0.3, "radius of that neighbourhood, and of where a first pose may be, metres", low=0.01)
     stay_limit: float = option(0.5, "r1 of Equation 2: P(stay) after an endless absence", low=0.0, high=1.0)
     significant_period_s: float = option(10.0, "absences shorter than this can't hold a move, s", low=0.0)
 
@@ -56,11 +60,9 @@ class Prediction:
 class Context:
     """Relations between objects."""
 
-    category_weight: float = option(0.5, "w1 of Equation 5", low=0.0, high=1.0)
-    instance_weight: float = option(0.5, "w2 of Equation 5", low=0.0, high=1.0)
-    same_category_ratio: float = option(2.0, "how much more often one category meets itself nearby", low=0.01)
-    neighbour_sigma_m: float = option(0.5, "scale of 'nearby', metres", low=0.01)
-    support_sigma_m: float = option(0.01, "how far a thing may float over or sink into its support, metres", low=1e-4)
+    relations: CategoryRelations = field(default_factory=CategoryRelations)
+    support_sigma_m: float = option(0.015, "how far a thing may float over or sink into its support, metres", low=1e-4)
+    other_support: float = option(0.02, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)
     penetration_sigma_m: float = option(0.01, "how deep objects may seem to intersect, metres", low=1e-4)
 
 
@@ -90,6 +92,7 @@ class Filter:
     min_particles: int = option(24, "of a class that is still possible", low=1)
     proposal_share: float = option(0.5, "particles drawn around refined modes rather than from the prediction", high=0.95)
     search_every: int = option(5, "keyframes between fresh searches", low=1)
+    search_share: float = option(0.25, "effort of such a search, as a share of the first one's", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)

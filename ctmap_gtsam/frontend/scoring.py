@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from factors.measurement import pixel_log_ratio
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
+from sequences.geometry import Plane, plane_depth
 from sequences.rendering.rasteriser import intrinsics, project, rasterise
 
 Array = NDArray[np.float64]
@@ -39,16 +40,23 @@ class Tile:
 
 
 def cut_tile(
-    camera: Camera, depth: NDArray[np.float32], background: NDArray[np.float32], box: Array, step: int
+    camera: Camera,
+    depth: NDArray[np.float32],
+    planes: tuple[Plane, ...],
+    box: Array,
+    step: int,
 ) -> Tile:
-    """The part of a depth image (h, w) within a box (x0, y0, x1, y1), clipped to the image, at least one sample."""
+    """The part of a depth image (h, w) within a box (x0, y0, x1, y1), clipped to the image, at least one sample.
+
+    The background is the nearest of the planes, which are in the camera frame.
+    """
     x0, y0 = (int(np.clip(np.floor(box[i]), 0, size - 1)) for i, size in ((0, camera.width), (1, camera.height)))
     x1 = int(np.clip(np.ceil(box[2]), x0 + 1, camera.width))
     y1 = int(np.clip(np.ceil(box[3]), y0 + 1, camera.height))
     part = (slice(y0, y1, step), slice(x0, x1, step))
     cut = np.ascontiguousarray(depth[part])
     window = camera.window(x0, y0, cut.shape[1], cut.shape[0], step)
-    return Tile(window, cut, np.ascontiguousarray(background[part]), x0, y0, step)
+    return Tile(window, cut, plane_depth(planes, window), x0, y0, step)
 
 
 @dataclass(frozen=True)
@@ -179,7 +187,7 @@ def _move(T, xi):
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _refine(vertices, faces, normals, poses, camera, depth, widths):
+def _refine(vertices, faces, normals, poses, camera, depth, widths, hessians):
     for k in numba.prange(poses.shape[0]):
         projected = np.empty((vertices.shape[0], 3))
         inverse_depth = np.empty(depth.shape)
@@ -191,6 +199,7 @@ def _refine(vertices, faces, normals, poses, camera, depth, widths):
             total = _normal_equations(
                 projected, faces, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
             )
+            hessians[k] = H
             if total < 6.0:
                 break
             for i in range(6):
@@ -207,7 +216,9 @@ def _refine(vertices, faces, normals, poses, camera, depth, widths):
         poses[k] = T
 
 
-def refine_on_depth(mesh: Mesh, normals: Array, tile: Tile, T_camera_object: Array, widths_m: Array) -> Array:
+def refine_on_depth(
+    mesh: Mesh, normals: Array, tile: Tile, T_camera_object: Array, widths_m: Array
+) -> tuple[Array, Array]:
     """Projective point-to-plane registration of hypotheses (K, 4, 4) to a tile's depth (Chen and Medioni, 1991).
 
     The observed points of the pixels that the object covers are drawn to the faces rendered there, with Geman-McClure
@@ -221,17 +232,12 @@ def refine_on_depth(mesh: Mesh, normals: Array, tile: Tile, T_camera_object: Arr
         widths_m: (steps,) the robust width at each step, metres.
 
     Returns:
-        (K, 4, 4) refined poses. Not all are better than their start: score them.
+        (K, 4, 4) refined poses, not all better than their start: score them; and (K, 6, 6) the last normal equations' J^T W J.
     """
     poses = np.array(T_camera_object, dtype=np.float64, order="C")
     camera = intrinsics(tile.camera)
-    _refine(mesh.vertices, mesh.faces, normals, poses, camera, tile.depth, np.asarray(widths_m, dtype=np.float64))
-    return poses
+    hessians = np.zeros((len(poses), 6, 6))
+    widths = np.asarray(widths_m, dtype=np.float64)
+    _refine(mesh.vertices, mesh.faces, normals, poses, camera, tile.depth, widths, hessians)
+    return poses, hessians
 
-
-def face_normals(mesh: Mesh) -> Array:
-    """(F, 3) unit normals, object frame; zero for degenerate faces."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    n = np.cross(b - a, c - a)
-    length = np.linalg.norm(n, axis=-1, keepdims=True)
-    return n / np.where(length == 0, 1.0, length)

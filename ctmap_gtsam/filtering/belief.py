@@ -1,0 +1,386 @@
+"""One object's belief, and how a keyframe changes it: the loop body of Algorithm 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.building import Tables
+from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
+from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.frontend.observation import Observation
+from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
+from ctmap_gtsam.frontend.surroundings import Surroundings
+from ctmap_gtsam.frontend.visibility import outlook
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
+from factors import mixture, symmetry
+from factors.mixture import log_sum
+from factors.persistence import stay_probability
+from sequences import se3
+from sequences.seeds import generator
+from sequences.types import Detection, LocalisationNoise
+
+Array = NDArray[np.float64]
+
+_INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
+_LIKELY = 15.0  # nats behind the best class within which modes are probed with care
+_MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
+_REPORTED = 0.01  # classes less probable than this are not reported with poses
+
+
+@dataclass(frozen=True)
+class ClassBelief:
+    """What is believed of one object if it is of one class."""
+
+    particles: Particles
+    log_evidence: float
+    """log p(depth and boxes so far, at this place | class) against nothing being there"""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of one object after a keyframe."""
+
+    object_id: int
+    classes: tuple[ClassBelief | None, ...]
+    """one a class of the catalogue; None where no pose explains anything"""
+    score_sum: Array
+    """(C,) class scores summed over this visit, as the detector's persistent belief takes them"""
+    score_evidence: Array
+    """(C,) log evidence of the visits before"""
+    log_clutter: float
+    """log evidence of something that no mesh explains"""
+    log_elsewhere: float
+    """log evidence of having been moved to where nobody looked"""
+    visit: int
+    time_ns: int
+    """of the last keyframe that had it in view"""
+    visible: bool
+    steps: int
+    """keyframes in view since the start"""
+
+    def class_log_evidence(self, model: Model) -> Array:
+        """(C,) log evidence of each class at this place, prior included."""
+        depth = np.array([-np.inf if c is None else c.log_evidence for c in self.classes])
+        return depth + self.score_evidence + model.class_evidence(self.score_sum) - np.log(len(self.classes))
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What is said of an object at a keyframe."""
+
+    class_probability: Array
+    """(C,)"""
+    existence: float
+    visible: bool
+    modes: tuple[tuple[int, float, Array, Array, Array], ...]
+    """class index, log weight, T_world_centre (4, 4), covariance (6, 6), free axes (6, f)"""
+    ledger: dict[str, float]
+
+    @property
+    def best_class(self) -> int:
+        """Index of the most probable class."""
+        return int(np.argmax(self.class_probability))
+
+    @property
+    def best_pose(self) -> Array | None:
+        """T_world_centre (4, 4) of the heaviest mode of the most probable class."""
+        own = [m for m in self.modes if m[0] == self.best_class]
+        return max(own, key=lambda m: m[1])[2] if own else None
+
+    def write(self, tables: Tables, row: int, keyframe: int, model: Model) -> None:
+        """Into an estimate's tables, poses in the mesh frame."""
+        tables.class_probability[row, keyframe] = self.class_probability
+        tables.existence[row, keyframe] = self.existence
+        tables.in_view[row, keyframe] = self.visible
+        for c, log_weight, T, covariance, free in self.modes:
+            shape = model.shapes[c]
+            tables.mode(
+                row,
+                keyframe,
+                shape.source.obj_id,
+                log_weight,
+                shape.to_object(T),
+                shape.covariance_to_object(covariance),
+                shape.free_axes_to_object(free),
+            )
+        for potential, nats in self.ledger.items():
+            tables.note(row, keyframe, potential, nats)
+
+
+class Updater:
+    """Starts, steps and reports beliefs."""
+
+    def __init__(self, model: Model, proposer: Proposer, localisation: LocalisationNoise) -> None:
+        self.model = model
+        self.proposer = proposer
+        self.localisation = localisation
+        radius = model.config.prediction.region_radius_m
+        self._log_volume = float(np.log(4.0 / 3.0 * np.pi * radius**3))
+
+    def start(self, track: Track, observation: Observation, around: Surroundings) -> Belief:
+        """The belief of a track that has just become consistent: a full search for every class."""
+        detection = track.at(observation.keyframe)
+        assert detection is not None
+        view = self.proposer.view(observation, np.array(detection.box), detection, around)
+        n = len(self.model.shapes)
+        score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
+        count = self.model.config.filter.particles // n
+        classes = []
+        for shape in self.model.shapes:
+            rng = self._rng("filter.start", track.track_id, observation, shape)
+            starts = self.proposer.search(shape, view, observation, rng)
+            modes = self._in_world(self.proposer.modes(shape, view, starts), observation)
+            classes.append(self._weigh(None, modes, shape, view, observation, count, rng))
+        fresh = Belief(
+            object_id=track.track_id,
+            classes=tuple(classes),
+            score_sum=score_sum,
+            score_evidence=np.zeros(n),
+            log_clutter=0.0,
+            log_elsewhere=-np.inf,
+            visit=observation.frame.visit,
+            time_ns=observation.frame.time_ns,
+            visible=True,
+            steps=1,
+        )
+        return replace(fresh, log_clutter=self._clutter(fresh, view, observation))
+
+    def step(
+        self, belief: Belief, detection: Detection | None, observation: Observation, around: Surroundings
+    ) -> Belief:
+        """Algorithm 1 for one object and keyframe."""
+        belief = self._enter_visit(belief, observation)
+        box = self._where(belief, detection, observation)
+        if box is None:
+            return replace(belief, visible=False)
+        belief = self._allow_move(belief, observation)
+        view = self.proposer.view(observation, box, detection, around)
+        likely = belief.class_log_evidence(self.model)
+        counts = self._counts(likely)
+        classes = tuple(
+            self._step_class(belief, shape, view, observation, int(counts[c]), likely[c] > likely.max() - _LIKELY)
+            for c, shape in enumerate(self.model.shapes)
+        )
+        scores = belief.score_sum if detection is None else belief.score_sum + self.model.class_scores(detection)
+        moved = replace(
+            belief,
+            classes=classes,
+            score_sum=scores,
+            time_ns=observation.frame.time_ns,
+            visible=True,
+            steps=belief.steps + 1,
+        )
+        return replace(moved, log_clutter=belief.log_clutter + self._clutter(moved, view, observation))
+
+    def report(self, belief: Belief, observation: Observation, around: Surroundings) -> Reported:
+        """The posterior, the context multiplied in once."""
+        log_evidence = belief.class_log_evidence(self.model)
+        weighted: list[tuple[ClassBelief, Array] | None] = []
+        context = np.zeros(len(self.model.shapes))
+        for c, own in enumerate(belief.classes):
+            if own is None or log_evidence[c] < log_evidence.max() - 3.0 * _LIKELY:
+                weighted.append(None)
+                continue
+            nats = self._context(self.model.shapes[c], own.particles.T_world_centre, around)
+            joint = own.particles.log_weight + nats
+            context[c] = float(log_sum(joint))
+            weighted.append((own, mixture.normalised(joint)))
+        probability = np.exp(mixture.normalised(log_evidence + context))
+        there = float(log_sum(log_evidence))
+        rivals = np.logaddexp(np.logaddexp(belief.log_clutter, 0.0), belief.log_elsewhere)
+        existence = 1.0 / (1.0 + np.exp(np.clip(rivals - there, -700.0, 700.0)))
+        modes: list[tuple[int, float, Array, Array, Array]] = []
+        for c, entry in enumerate(weighted):
+            if entry is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
+                own, log_weight = entry
+                modes += _modes(c, Particles(own.particles.T_world_centre, log_weight), self.model.shapes[c])
+        best = int(np.argmax(probability))
+        chosen = belief.classes[best]
+        ledger = {
+            "depth": 0.0 if chosen is None else chosen.log_evidence,
+            "class": float((belief.score_evidence + self.model.class_evidence(belief.score_sum))[best]),
+            "context": float(context[best]),
+        }
+        return Reported(probability, float(existence), belief.visible, tuple(modes), ledger)
+
+    def _context(self, shape: Shape, T: Array, around: Surroundings) -> Array:
+        if not self.model.context:
+            return np.zeros(len(T))
+        return np.asarray(sum(around.log_context(self.model, shape, T).values()))
+
+    def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
+        """A new visit: the detector's persistent belief of the last one has said what it had to say."""
+        if observation.frame.visit == belief.visit:
+            return belief
+        evidence = belief.score_evidence + self.model.class_evidence(belief.score_sum)
+        return replace(
+            belief,
+            visit=observation.frame.visit,
+            score_evidence=evidence,
+            score_sum=np.zeros_like(belief.score_sum),
+        )
+
+    def _where(self, belief: Belief, detection: Detection | None, observation: Observation) -> Array | None:
+        """The box to look in: the detection's, or where the most probable class would appear; None out of view."""
+        if detection is not None:
+            return np.array(detection.box)
+        best = int(np.argmax(belief.class_log_evidence(self.model)))
+        own = belief.classes[best]
+        if own is None:
+            return None
+        T = observation.frame.T_camera_world @ own.particles.best(1)[0]
+        seen = outlook(self.model.shapes[best], T, observation.frame.camera)
+        return seen.box if seen.share > 0.0 and (seen.box[2:] >= 2.0).all() else None
+
+    def _allow_move(self, belief: Belief, observation: Observation) -> Belief:
+        """After a significant absence the object stayed with S(dt) (Equation 3), or is where nobody has looked."""
+        gap = (observation.frame.time_ns - belief.time_ns) * 1e-9
+        settings = self.model.config.prediction
+        if belief.visible or gap < settings.significant_period_s:
+            return belief
+        total = belief.class_log_evidence(self.model)
+        r1 = settings.stay_limit
+        stay = np.array([stay_probability(gap, s.source.persistence_s, r1, 1.0 - r1) for s in self.model.shapes])
+        stay = np.where([s.source.movable for s in self.model.shapes], stay, 1.0)
+        with np.errstate(divide="ignore"):
+            left = float(log_sum(total + np.log1p(-stay)))
+        classes = tuple(
+            None if own is None else replace(own, log_evidence=own.log_evidence + float(np.log(stay[c])))
+            for c, own in enumerate(belief.classes)
+        )
+        return replace(belief, classes=classes, log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)))
+
+    def _counts(self, log_evidence: Array) -> NDArray[np.int64]:
+        """Particles a class, by its probability, none fewer than the least."""
+        settings = self.model.config.filter
+        share = np.exp(mixture.normalised(log_evidence))
+        return np.maximum(np.round(settings.particles * share), settings.min_particles).astype(np.int64)
+
+    def _step_class(
+        self, belief: Belief, shape: Shape, view: View, observation: Observation, count: int, likely: bool
+    ) -> ClassBelief | None:
+        own = belief.classes[shape.index]
+        rng = self._rng("filter.step", belief.object_id, observation, shape)
+        starts = np.zeros((0, 4, 4))
+        if own is not None:
+            starts = observation.frame.T_camera_world @ own.particles.best(3)
+        if view.detection is not None and belief.steps % self.model.config.filter.search_every == 0:
+            found = self.proposer.search(shape, view, observation, rng, self.model.config.filter.search_share)
+            starts = np.concatenate([starts, found])
+        modes = self._in_world(self.proposer.modes(shape, view, starts, probe=likely), observation)
+        spread = self._spread(observation, belief.time_ns, starts)
+        return self._weigh(own, modes, shape, view, observation, count, rng, spread)
+
+    def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
+        """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
+        settings, noise = self.model.config.prediction, self.localisation
+        dt = max((observation.frame.time_ns - before_ns) * 1e-9, 1e-3)
+        # two recorded poses that lie closer than the correlation time err together
+        apart = 2.0 * (1.0 - np.exp(-dt / max(noise.correlation_time_s, 1e-9)))
+        away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
+        return Spread(
+            float(np.sqrt(settings.rotation_rate**2 * dt + apart * noise.rotation_rad**2)),
+            float(
+                np.sqrt(
+                    settings.translation_rate**2 * dt
+                    + apart * (noise.translation_m**2 + (away * noise.rotation_rad) ** 2)
+                )
+            ),
+        )
+
+    def _weigh(
+        self,
+        own: ClassBelief | None,
+        modes: tuple[PoseModes, Gaussians | None],
+        shape: Shape,
+        view: View,
+        observation: Observation,
+        count: int,
+        rng: np.random.Generator,
+        spread: Spread | None = None,
+    ) -> ClassBelief | None:
+        """Draw from prediction and proposals, weigh by the model (see `particles`)."""
+        proposals = modes[1]
+        log_uniform = -(shape.symmetry.log_quotient_rotations + self._log_volume)
+        if proposals is None and own is None:
+            return None
+        jump = self.model.config.prediction.jump_probability
+        share = 1.0 if own is None else self.model.config.filter.proposal_share if proposals is not None else 0.0
+        n_proposed = round(share * count)
+        drawn, log_q = [], []
+        if own is not None and spread is not None:
+            drawn.append(predict(own.particles, count - n_proposed, spread, shape, rng))
+        if proposals is not None:
+            drawn.append(proposals.draw(n_proposed, shape, rng))
+        T = np.concatenate(drawn)
+        log_prior = np.full(len(T), log_uniform)
+        if own is not None and spread is not None:
+            predicted = predicted_log_density(own.particles, T, spread, shape)
+            log_prior = np.logaddexp(np.log1p(-jump) + predicted, np.log(jump) + log_uniform)
+            log_q.append(np.log1p(-share) + predicted)
+        if proposals is not None:
+            log_q.append(np.log(share) + proposals.log_density(T, shape))
+        score, _ = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
+        log_weight = log_prior + score - np.logaddexp.reduce(log_q, axis=0)
+        gained = float(log_sum(log_weight)) - np.log(len(T))
+        before = 0.0 if own is None else own.log_evidence
+        return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained)
+
+    def _in_world(self, modes: PoseModes, observation: Observation) -> tuple[PoseModes, Gaussians | None]:
+        """The modes as proposals in the world frame."""
+        if not len(modes):
+            return modes, None
+        # half of the proposals' weight goes by likelihood, half is spread evenly: the likelihood may be wrong
+        by_score = np.exp(mixture.normalised(modes.log_likelihood))
+        weight = np.log(0.5 * by_score + 0.5 / len(modes))
+        poses = observation.frame.T_world_camera @ modes.T_camera_centre
+        return modes, Gaussians(poses, _INFLATION * modes.covariance, weight)
+
+    def _clutter(self, belief: Belief, view: View, observation: Observation) -> float:
+        """What this keyframe says for something that no mesh explains, where the best hypothesis stands, nats."""
+        best = int(np.argmax(belief.class_log_evidence(self.model)))
+        own = belief.classes[best]
+        rate = self.model.config.detector.clutter_rate
+        if own is None:
+            return 0.0
+        T = observation.frame.T_camera_world @ own.particles.best(1)
+        _, scores = self.proposer.score(self.model.shapes[best], view, T)
+        gain = self.model.kappa * self.model.config.sensor.clutter_gain * float(scores.visible[0])
+        if view.detection is None:
+            return float(np.log1p(-rate))
+        # the box of clutter is as good as the best box of an object
+        box = np.array(view.detection.box)
+        return gain + float(np.log(rate)) + float(self.model.box(box, box[None], view.image_size)[0])
+
+    def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
+        return generator(
+            self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index
+        )
+
+
+def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:
+    """The heaviest particle's mode, moments matched, and the next one apart from it, if it weighs anything."""
+    out: list[tuple[int, float, Array, Array, Array]] = []
+    left = particles.log_weight.copy()
+    for _ in range(2):
+        heaviest = int(np.argmax(left))
+        if left[heaviest] < np.log(1e-3):
+            break
+        images = symmetry.nearest_image(particles.T_world_centre[heaviest], particles.T_world_centre, shape.symmetry)
+        r = se3.local(particles.T_world_centre[heaviest], images)
+        near = (np.linalg.norm(r[:, :3], axis=-1) < _MODE_RADIUS[0]) & (
+            np.linalg.norm(r[:, 3:], axis=-1) < _MODE_RADIUS[1]
+        )
+        near &= np.isfinite(left)
+        near[heaviest] = True
+        T, covariance = mixture.moment_match(images[near], np.zeros((int(near.sum()), 6, 6)), left[near], iterations=4)
+        free = shape.symmetry.free_axes
+        # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
+        covariance = covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
+        out.append((c, float(log_sum(left[near])), T, covariance, free))
+        left[near] = -np.inf
+    return out

@@ -1,0 +1,133 @@
+"""Boxes become tracks: the paper's association of boxes over frames by their overlap, causally, for filter and smoother alike.
+
+A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera: the
+overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track. A
+new track counts only after `start_after` consistent frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from ctmap_gtsam.frontend.observation import Observation, centre_point
+from ctmap_gtsam.parameters import Frontend
+from factors.measurement import box_iou
+from sequences import se3
+from sequences.types import Detection, Frame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """Detections taken for one object."""
+
+    track_id: int
+    """in order of the first detection; ties in the canonical order of detections"""
+    keyframes: tuple[int, ...]
+    """rows of Estimate.keyframe_frame, ascending"""
+    detections: tuple[Detection, ...]
+    """one a keyframe"""
+    started: int
+    """the keyframe at which it had been consistent for long enough"""
+
+    def at(self, keyframe: int) -> Detection | None:
+        """Its detection at a keyframe, if any."""
+        return self.detections[self.keyframes.index(keyframe)] if keyframe in self.keyframes else None
+
+
+@dataclass
+class _Open:
+    """A track while it grows."""
+
+    point_world: Array
+    box: Array
+    z: float
+    last_ns: int
+    streak: int
+    keyframes: list[int] = field(default_factory=list)
+    detections: list[Detection] = field(default_factory=list)
+    started: int | None = None
+
+
+class Associator:
+    """Grows tracks from observations in order of time; what it says of a keyframe depends on the past alone."""
+
+    def __init__(self, settings: Frontend) -> None:
+        self._settings = settings
+        self._tracks: list[_Open] = []
+
+    def step(self, observation: Observation) -> None:
+        """Take in the next keyframe."""
+        frame, detections = observation.frame, observation.frame.detections
+        points = [centre_point(frame, observation.depth, np.array(d.box)) for d in detections]
+        usable = [i for i, point in enumerate(points) if point is not None]
+        matched = self._match(frame, [detections[i] for i in usable])
+        for track, i in matched.items():
+            self._extend(self._tracks[track], observation, detections[usable[i]], points[usable[i]])
+        taken = {usable[i] for i in matched.values()}
+        self._age(frame, set(matched))
+        for i in usable:
+            if i not in taken:
+                self._open(observation, detections[i], points[i])
+
+    def tracks(self) -> tuple[Track, ...]:
+        """All tracks so far that have been consistent for long enough."""
+        return tuple(
+            Track(i, tuple(t.keyframes), tuple(t.detections), t.started)
+            for i, t in enumerate(self._tracks)
+            if t.started is not None
+        )
+
+    def _match(self, frame: Frame, detections: list[Detection]) -> dict[int, int]:
+        """Hungarian assignment by overlap with the predicted boxes: track -> detection."""
+        if not detections or not self._tracks:
+            return {}
+        predicted = np.stack([_predicted_box(t, frame) for t in self._tracks])
+        boxes = np.array([d.box for d in detections])
+        overlap = box_iou(predicted[:, None], boxes[None])
+        rows, columns = linear_sum_assignment(-overlap)
+        least = self._settings.association_iou
+        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if overlap[r, c] >= least}
+
+    def _extend(self, track: _Open, observation: Observation, detection: Detection, point: Array | None) -> None:
+        assert point is not None
+        frame = observation.frame
+        track.point_world, track.box, track.last_ns = point, np.array(detection.box), frame.time_ns
+        track.z = float(se3.transform(frame.T_camera_world, point[None])[0, 2])
+        track.keyframes.append(observation.keyframe)
+        track.detections.append(detection)
+        track.streak += 1
+        if track.started is None and track.streak >= self._settings.start_after:
+            track.started = observation.keyframe
+
+    def _age(self, frame: Frame, matched: set[int]) -> None:
+        """Tracks that were not met: one that has not started must be consistent, and is given up when it was not."""
+        for i, track in enumerate(self._tracks):
+            if i in matched or track.started is not None:
+                continue
+            track.streak = 0
+            if frame.time_ns - track.last_ns > self._settings.lost_after_s * 1e9:
+                track.box = np.full(4, np.nan)
+
+    def _open(self, observation: Observation, detection: Detection, point: Array | None) -> None:
+        assert point is not None
+        track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, 0)
+        self._tracks.append(track)
+        self._extend(track, observation, detection, point)
+
+
+def _predicted_box(track: _Open, frame: Frame) -> Array:
+    """The track's last box (x, y, w, h) carried to another camera: centre projected, size scaled by depth, clipped."""
+    centre = se3.transform(frame.T_camera_world, track.point_world[None])[0]
+    if centre[2] <= 0.0 or np.isnan(track.box).any():
+        return np.zeros(4)
+    size = track.box[2:] * track.z / centre[2]
+    low = frame.camera.project(centre) - size / 2
+    image = np.array([frame.camera.width, frame.camera.height])
+    clipped = np.clip(np.concatenate([low, low + size]), 0.0, np.tile(image, 2))
+    return np.concatenate([clipped[:2], clipped[2:] - clipped[:2]])

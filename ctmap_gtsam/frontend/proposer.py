@@ -1,0 +1,230 @@
+"""Poses that explain the depth: drawn as the paper draws its first particles, refined on the depth image, scored.
+
+The paper puts an object's centre around the 3-D points in the box's centre region, with an orientation uniform on SO(3). One such
+draw in some thousands lies within reach of the truth, so the best by score are refined by point-to-plane registration,
+tried again from starts around them and from half-turns, and what remains are the score's modes: the proposals of
+filter and smoother, which weigh them with the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth
+from ctmap_gtsam.frontend.scoring import Scores, Tile, cut_tile, refine_on_depth, score_depth
+from ctmap_gtsam.frontend.surroundings import Surroundings
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
+from factors.symmetry import residual
+from sequences import se3
+from sequences.types import Detection
+
+Array = NDArray[np.float64]
+
+_HALF_TURNS = np.stack([np.diag(d).astype(np.float64) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+_LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
+"""steps at which the score's shape is probed, metres at the object's radius"""
+_SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
+
+
+@dataclass(frozen=True)
+class View:
+    """One track in one keyframe: where to look, and what the detector said there."""
+
+    tile: Tile
+    detection: Detection | None
+    image_size: tuple[int, int]
+    """width, height"""
+
+
+@dataclass(frozen=True)
+class PoseModes:
+    """Maxima of the measurement potential for one class in one view, best first: n of them."""
+
+    T_camera_centre: Array
+    """(n, 4, 4)"""
+    log_likelihood: Array
+    """(n,) tempered depth ratio plus the box's, nats"""
+    depth_log_ratio: Array
+    """(n,) the depth's part of it"""
+    covariance: Array
+    """(n, 6, 6) of the right tangent, from the score's own shape"""
+    free_axes: Array
+    """(n, 6, 3) directions the score is flat in, orthonormal columns, zero where unused"""
+
+    def __len__(self) -> int:
+        return len(self.log_likelihood)
+
+
+class Proposer:
+    """Finds poses in views. Counts the hypotheses it had scored."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.settings = model.config.frontend
+        self.hypotheses_scored = 0
+        first, last = self.settings.refinement_widths_m
+        steps = self.settings.refinement_steps
+        self._coarse = np.geomspace(first, last, max(1, steps // 2))
+        self._fine = np.full(max(1, steps - len(self._coarse)), last)
+
+    def view(
+        self, observation: Observation, box: Array, detection: Detection | None, surroundings: Surroundings | None = None
+    ) -> View:
+        """The region of a box (x, y, w, h) enlarged by the margin.
+
+        Args:
+            observation: the keyframe.
+            box: where the object is looked for, pixels.
+            detection: the track's detection here, if there is one.
+            surroundings: whose neighbours join the background.
+        """
+        camera = observation.frame.camera
+        x, y, w, h = box
+        margin = self.settings.region_margin
+        region = np.array([x - margin * w, y - margin * h, x + (1 + margin) * w, y + (1 + margin) * h])
+        step = max(1, round(camera.fx * self.settings.angular_step_rad))
+        tile = cut_tile(camera, observation.depth, observation.planes, region, step)
+        if surroundings is not None:
+            tile = surroundings.behind(tile, observation.frame.T_camera_world)
+        return View(tile, detection, (camera.width, camera.height))
+
+    def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
+        """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
+        self.hypotheses_scored += len(T_camera_centre)
+        scores = score_depth(
+            shape.mesh, view.tile, T_camera_centre, self.model.depth_parameters, self.model.config.sensor.occlusion_margin_m
+        )
+        return self.model.log_likelihood(scores, view.detection, view.image_size), scores
+
+    def search(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0) -> Array:
+        """A fresh search in a view with a detection: refined poses (K, 4, 4), not yet sorted out.
+
+        Args:
+            share: of the configured effort.
+        """
+        drawn = self._draw(shape, view, observation, rng, max(8, round(share * self.settings.fresh_poses)))
+        if drawn is None:
+            return np.zeros((0, 4, 4))
+        keep = max(2, round(share * self.settings.refined_poses))
+        coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse)
+        best = self._best(shape, view, coarse, max(1, keep // 6))
+        around = self._refine(shape, view, self._perturb(shape, best, rng), self._coarse[len(self._coarse) // 2 :])
+        return np.concatenate([coarse, around])
+
+    def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True) -> PoseModes:
+        """Refine starts (K, 4, 4), score, merge equal ones and keep the best few.
+
+        Args:
+            probe: whether to take the covariance from the score's shape (else from the registration's normal equations).
+        """
+        if len(starts) == 0:
+            return _no_modes()
+        candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
+        score, scores = self.score(shape, view, candidates)
+        keep = self._distinct(shape, candidates, score)
+        poses = candidates[keep]
+        covariance, free = self._shape_of_score(shape, view, poses, scores.log_ratio[keep], probe)
+        return PoseModes(poses, score[keep], self.model.kappa * scores.log_ratio[keep], covariance, free)
+
+    def _draw(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int) -> Array | None:
+        """The paper's first particles: (n, 4, 4)."""
+        assert view.detection is not None
+        box = np.array(view.detection.box)
+        z = centre_depth(observation.depth, box)
+        if z == 0.0:
+            return None
+        uniforms = rng.random((n, 6))
+        offsets = (uniforms[:, :2] - 0.5) * CENTRE_REGION + 0.5
+        pixels = box[:2] + offsets * box[2:]
+        # the centre lies behind the surface that is seen, by anything up to its extent
+        behind = z + uniforms[:, 2] * np.abs(shape.mesh.vertices).max()
+        centres = observation.frame.camera.backproject(pixels[:, 0], pixels[:, 1], behind)
+        return se3.make(se3.uniform_rotations(uniforms[:, 3:]), centres)
+
+    def _best(self, shape: Shape, view: View, poses: Array, n: int) -> Array:
+        score, _ = self.score(shape, view, poses)
+        return poses[np.argsort(-score, kind="stable")[:n]]
+
+    def _refine(self, shape: Shape, view: View, poses: Array, widths: Array) -> Array:
+        return refine_on_depth(shape.mesh, shape.normals, view.tile, poses, widths)[0]
+
+    def _perturb(self, shape: Shape, poses: Array, rng: np.random.Generator) -> Array:
+        """Starts around poses: half-turns about the box's axes, and random turns and shifts."""
+        turned = poses[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3))
+        noise = rng.normal(size=(len(poses), self.settings.perturbed_poses, 6))
+        noise *= np.repeat([0.35, 0.2 * shape.radius_m], 3)
+        around = se3.retract(poses[:, None], noise)
+        return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
+
+    def _distinct(self, shape: Shape, poses: Array, score: Array) -> list[int]:
+        """Rows of the best poses that differ from each other, symmetry allowed for."""
+        kept: list[int] = []
+        for row in np.argsort(-score, kind="stable"):
+            if len(kept) == self.settings.max_modes:
+                break
+            if kept:
+                r = residual(poses[kept], poses[row], shape.symmetry)
+                turned, moved = np.linalg.norm(r[:, :3], axis=-1), np.linalg.norm(r[:, 3:], axis=-1)
+                if ((turned < _SAME_ROTATION_RAD) & (moved < _SAME_TRANSLATION_M)).any():
+                    continue
+            kept.append(int(row))
+        return kept
+
+    def _shape_of_score(
+        self, shape: Shape, view: View, poses: Array, log_ratio: Array, probe: bool
+    ) -> tuple[Array, Array]:
+        """Covariances (n, 6, 6) and free axes (n, 6, 3): how far the score lets a pose go along its normal equations' axes.
+
+        The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
+        """
+        hessian = refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
+        unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
+        directions = np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)  # (n, 6 directions, 6)
+        if not probe:
+            return self._laplace(hessian, unit), np.zeros((len(poses), 6, 3))
+        steps = np.concatenate([_LADDER_M, -_LADDER_M])
+        offsets = directions[:, :, None] * steps[:, None] * unit
+        moved = se3.retract(poses[:, None, None], offsets).reshape(-1, 4, 4)
+        depth = score_depth(shape.mesh, view.tile, moved, self.model.depth_parameters, 0.0).log_ratio
+        self.hypotheses_scored += len(moved)
+        drop = self.model.kappa * (log_ratio[:, None, None] - depth.reshape(len(poses), 6, -1))
+        sigma, flat = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
+        scaled = directions * unit
+        covariance = np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled)
+        return covariance, _free_axes(scaled, flat)
+
+    def _laplace(self, hessian: Array, unit: Array) -> Array:
+        sensor = self.model.config.sensor
+        scaled = hessian * unit[:, None] * unit * self.model.kappa / sensor.sigma_m**2
+        scaled = scaled + np.eye(6) / _LADDER_M[-1] ** 2
+        return np.linalg.inv(scaled) * unit[:, None] * unit
+
+
+def _widths(drop: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Standard deviations (n, 6) in scaled metres, from the fall of the log-likelihood (n, 6, steps) along each direction.
+
+    The first step at which it falls by half a nat, one standard deviation of a Gaussian, tells the width by its parabola.
+    """
+    reached = drop >= 0.5
+    flat = ~reached.any(axis=-1)
+    first = np.where(flat, len(_LADDER_M) - 1, np.argmax(reached, axis=-1))
+    fall = np.maximum(np.take_along_axis(drop, first[..., None], axis=-1)[..., 0], 0.5)
+    return _LADDER_M[first] / np.sqrt(2.0 * fall), flat
+
+
+def _free_axes(directions: Array, flat: NDArray[np.bool_]) -> Array:
+    """Up to three flat directions as unit columns: (n, 6, 6), (n, 6) -> (n, 6, 3)."""
+    out = np.zeros((len(directions), 6, 3))
+    for row in range(len(directions)):
+        chosen = directions[row][flat[row]][:3]
+        if len(chosen):
+            out[row, :, : len(chosen)] = np.linalg.qr(chosen.T)[0]
+    return out
+
+
+def _no_modes() -> PoseModes:
+    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros((0, 6, 3)))

@@ -1,0 +1,141 @@
+"""What stands around an object when it is weighed: its neighbours' best poses, the level surfaces, which way is up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.frontend.observation import Observation
+from ctmap_gtsam.frontend.scoring import Tile
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
+from factors.context import context_log_ratio, hinge_log_potential
+from sequences import se3
+from sequences.geometry import Plane
+from sequences.rendering.scene import render_scene
+from sequences.types import Run
+
+Array = NDArray[np.float64]
+
+_LEVEL_RAD = 0.35  # planes steeper than this carry nothing
+_CONTACTS = 48  # surface points of a neighbour that are tested for penetration
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """Another object by its most likely particle, as Algorithm 1 takes it."""
+
+    object_id: int
+    shape: Shape
+    T_world_centre: Array
+    """(4, 4)"""
+
+
+@dataclass
+class Gravity:
+    """Which way is up, as far as has been seen: given by the run, or the mean of what the planes say."""
+
+    up_world: Array | None
+    given: bool
+    _sum: Array = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def of(cls, run: Run) -> Gravity:
+        """From the run's own statement, if it has one."""
+        return cls(run.up_world, run.up_world is not None)
+
+    def update(self, observation: Observation) -> None:
+        """Take in one keyframe."""
+        up = observation.up_camera
+        if self.given or up is None:
+            return
+        self._sum = self._sum + observation.frame.T_world_camera[:3, :3] @ up
+        self.up_world = self._sum / np.linalg.norm(self._sum)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """At one keyframe, in the world frame."""
+
+    neighbours: tuple[Neighbour, ...]
+    supports: tuple[Plane, ...]
+    """level planes in view, world frame; empty where up is unknown"""
+
+    @classmethod
+    def of(cls, observation: Observation, gravity: Gravity, neighbours: tuple[Neighbour, ...]) -> Surroundings:
+        """The level planes of a keyframe, and who is there."""
+        return cls(neighbours, level_planes(observation, gravity.up_world))
+
+    def without(self, object_id: int) -> Surroundings:
+        """The same for one object: it is not its own neighbour."""
+        return replace(self, neighbours=tuple(n for n in self.neighbours if n.object_id != object_id))
+
+    def behind(self, tile: Tile, T_camera_world: Array) -> Tile:
+        """The tile with the neighbours joined to its background: their pixels are theirs."""
+        items = [(n.shape.mesh, T_camera_world @ n.T_world_centre) for n in self.neighbours]
+        if not items:
+            return tile
+        there = render_scene(items, tile.camera).depth
+        nearer = (there > 0) & ((tile.background == 0) | (there < tile.background))
+        return replace(tile, background=np.where(nearer, there, tile.background))
+
+    def log_context(self, model: Model, shape: Shape, T_world_centre: Array) -> dict[str, Array]:
+        """The context potential of poses (K, 4, 4) by kind, nats (K,) each: once for a stationary episode."""
+        return {
+            "context": self._category(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre),
+            "support": support_log_potential(model, shape, T_world_centre, self.supports),
+        }
+
+    def _category(self, model: Model, shape: Shape, T: Array) -> Array:
+        total = np.zeros(len(T))
+        for other in self.neighbours:
+            distance = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
+            total += context_log_ratio(distance, model.relations[shape.index, other.shape.index])
+        return total
+
+    def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
+        deepest = np.zeros(len(T))
+        for other in self.neighbours:
+            apart = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
+            near = np.flatnonzero(apart < shape.reach_m + other.shape.reach_m)
+            if len(near):
+                points = other.shape.surface_points(_CONTACTS)
+                inside = se3.transform(se3.inverse(T[near]) @ other.T_world_centre, points)
+                deepest[near] = np.maximum(deepest[near], penetration_depth(shape, inside))
+        return hinge_log_potential(deepest, model.config.context.penetration_sigma_m)
+
+
+def penetration_depth(shape: Shape, points: Array) -> Array:
+    """How deep the deepest of points (K, P, 3), centre frame, lies inside a shape: (K,) metres, 0 outside.
+
+    The distance to the nearest surface sample, inside where that sample's normal points away.
+    """
+    tree, normals = shape.surface_tree
+    distance, nearest = tree.query(points)
+    towards = ((points - tree.data[nearest]) * normals[nearest]).sum(-1)
+    return np.where(towards < 0, distance, 0.0).max(axis=-1)
+
+
+def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:
+    """How well poses (K, 4, 4) rest on a level surface, nats (K,): a hinge on the gap, either way, floored.
+
+    The floor says that a thing may rest on something that was not seen. 0 where no surface is known below.
+    """
+    settings = model.config.context
+    best = np.full(len(T_world_centre), -np.inf)
+    for plane in supports:
+        heights = se3.transform(T_world_centre, shape.hull_points) @ plane.normal - plane.offset
+        potential = hinge_log_potential(np.abs(heights.min(axis=-1)), settings.support_sigma_m)
+        above = plane.contains(T_world_centre[:, :3, 3])
+        best = np.where(above, np.maximum(best, potential), best)
+    return np.where(np.isneginf(best), 0.0, np.logaddexp(best, np.log(settings.other_support)))
+
+
+def level_planes(observation: Observation, up_world: Array | None) -> tuple[Plane, ...]:
+    """The planes of a keyframe that things can rest on, world frame."""
+    if up_world is None:
+        return ()
+    planes = (plane.moved(observation.frame.T_world_camera) for plane in observation.planes)
+    return tuple(p for p in planes if p.normal @ up_world > np.cos(_LEVEL_RAD))

@@ -1,0 +1,94 @@
+"""The potentials bound to settings and catalogue: the one object that filter, graph and ledger hold."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.config import Config
+from ctmap_gtsam.frontend.scoring import Scores
+from ctmap_gtsam.shapes import Shape, build_shapes
+from factors.context import PairMixture, relation_table
+from factors.measurement import (
+    DepthModel,
+    box_log_ratio,
+    class_log_ratio,
+    confusion,
+    detection_log_ratio,
+    persistent_class_log_evidence,
+)
+from sequences.catalogue import Catalogue
+from sequences.types import Detection
+
+Array = NDArray[np.float64]
+
+
+class Model:
+    """What every number means, for one catalogue and one configuration."""
+
+    def __init__(self, catalogue: Catalogue, config: Config, *, context: bool = True) -> None:
+        self.catalogue = catalogue
+        self.config = config
+        self.context = context
+        self.kappa = config.sensor.kappa
+
+    @cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """One a class, in the catalogue's order."""
+        return build_shapes(self.catalogue, self.config.frontend.mesh_faces)
+
+    @cached_property
+    def relations(self) -> PairMixture:
+        """Category-level relations of all pairs of classes."""
+        classes = self.catalogue.classes
+        names, categories = [c.name for c in classes], [c.category for c in classes]
+        return relation_table(names, categories, self.config.context.relations)
+
+    @cached_property
+    def depth_parameters(self) -> tuple[float, ...]:
+        """What the fused kernel takes."""
+        s = self.config.sensor
+        depth = DepthModel(
+            s.sigma_m, s.sigma_quadratic_per_m, s.outlier_weight, s.range_m, s.occluder_weight, s.background_sigma_m
+        )
+        return depth.parameters()
+
+    @cached_property
+    def log_confusion(self) -> Array:
+        """(C, C) log pi(d | c): the class d that the detector persistently believes, for the true class c (columns d)."""
+        return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
+
+    def log_likelihood(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
+        """log phi_m (K,) of rendered hypotheses but for the class scores: tempered depth and the box, nats.
+
+        A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1).
+        """
+        visible = np.divide(scores.visible, scores.covered, out=np.zeros_like(scores.visible), where=scores.covered > 0)
+        boxes = None
+        if detection is not None:
+            rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
+            boxes = self.box(np.array(detection.box), rendered, image_size)
+        return self.kappa * scores.log_ratio + self.detection(visible, boxes)
+
+    def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
+        """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), xywh; some boxes have nothing to do with theirs."""
+        d = self.config.detector
+        matched = box_log_ratio(detected, np.nan_to_num(rendered), d.box_sigma, image_size)
+        return np.logaddexp(np.log1p(-d.box_outlier) + matched, np.log(d.box_outlier))
+
+    def detection(self, visible: Array, box_log_ratios: Array | None) -> Array:
+        """log of the detection potential (K,) for visible shares (K,): with its track's box (K,), or missed (None)."""
+        p = self.config.detector.detection_probability
+        if box_log_ratios is None:
+            return np.log1p(-p * visible)
+        return detection_log_ratio(p, visible, box_log_ratios[:, None], np.zeros((len(visible), 1)))
+
+    def class_scores(self, detection: Detection) -> Array:
+        """(C,) log p(s | d) / p(s | clutter) of a score vector for each class d that the detector may believe in."""
+        return class_log_ratio(detection.class_scores, floor=self.config.detector.score_floor)
+
+    def class_evidence(self, summed: Array) -> Array:
+        """(C,) log evidence of the true class c from the summed class_scores (C,) of one track and visit: saturating."""
+        return persistent_class_log_evidence(summed, self.log_confusion)

@@ -1,0 +1,123 @@
+"""A class as the estimators see it: a coarse mesh about its own centre.
+
+Estimators work with the pose of the *centre frame*, which lies in the middle of the bounding box, or on the axis of a
+continuous symmetry, so that rotation and translation are nearly independent and a symmetry axis passes through the origin.
+Poses leave an estimator in the catalogue's mesh frame (`Shape.to_object`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
+
+from factors.symmetry import Symmetry
+from sequences import se3
+from sequences.catalogue import Catalogue, Mesh, ObjectClass
+from sequences.meshes import simplify
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One class in its centre frame; lengths in metres."""
+
+    index: int
+    """position in the catalogue"""
+    source: ObjectClass
+    """the class as catalogued"""
+    T_object_centre: Array
+    """(4, 4) a pure translation"""
+    mesh: Mesh
+    """coarse, in the centre frame"""
+    normals: Array
+    """(F, 3) of its faces"""
+    symmetry: Symmetry
+    """in the centre frame"""
+    radius_m: float
+    """root mean square distance of the surface from the centre: turns rad into metres"""
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Radius of the sphere about the centre that holds it."""
+        return float(np.linalg.norm(self.mesh.vertices, axis=-1).max())
+
+    @cached_property
+    def hull_points(self) -> Array:
+        """(H, 3) vertices of the convex hull, centre frame: what can touch a plane."""
+        return self.mesh.vertices[ConvexHull(self.mesh.vertices).vertices]
+
+    @cached_property
+    def surface_tree(self) -> tuple[cKDTree, Array]:
+        """KD-tree of the faces' middles, and their normals (F, 3)."""
+        return cKDTree(self.mesh.vertices[self.mesh.faces].mean(axis=1)), self.normals
+
+    def surface_points(self, n: int) -> Array:
+        """(<= n, 3) middles of faces spread over the surface, centre frame."""
+        middles = self.surface_tree[0].data
+        return np.asarray(middles[:: max(1, len(middles) // n)])
+
+    def to_object(self, T_frame_centre: Array) -> Array:
+        """Poses (..., 4, 4) of the centre frame -> of the mesh frame."""
+        return T_frame_centre @ se3.inverse(self.T_object_centre)
+
+    def to_centre(self, T_frame_object: Array) -> Array:
+        """Poses (..., 4, 4) of the mesh frame -> of the centre frame."""
+        return T_frame_object @ self.T_object_centre
+
+    def covariance_to_object(self, covariance: Array) -> Array:
+        """Covariances (..., 6, 6) of the centre frame's right tangent -> of the mesh frame's."""
+        A = se3.adjoint(self.T_object_centre)
+        return A @ covariance @ A.T
+
+    def free_axes_to_object(self, free: Array) -> Array:
+        """Orthonormal columns (6, f) in the centre frame's tangent -> spanning the same motions in the mesh frame's."""
+        if free.shape[-1] == 0:
+            return free
+        return np.asarray(np.linalg.qr(se3.adjoint(self.T_object_centre) @ free)[0])
+
+
+def build_shapes(catalogue: Catalogue, faces: int) -> tuple[Shape, ...]:
+    """One shape a class, in the catalogue's order; `faces` bounds the coarse meshes."""
+    return tuple(_build(index, source, faces) for index, source in enumerate(catalogue.classes))
+
+
+def _build(index: int, source: ObjectClass, faces: int) -> Shape:
+    coarse = simplify(source.mesh, faces)
+    symmetry = Symmetry.of(source)
+    centre = _centre(source, symmetry)
+    mesh = Mesh(np.ascontiguousarray(coarse.vertices - centre), np.ascontiguousarray(coarse.faces), coarse.colours)
+    T = se3.make(np.eye(3), centre)
+    return Shape(
+        index=index,
+        source=source,
+        T_object_centre=T,
+        mesh=mesh,
+        normals=_face_normals(mesh),
+        symmetry=Symmetry(
+            discrete=se3.inverse(T) @ symmetry.discrete @ T, axes=symmetry.axes, offsets=symmetry.offsets - centre
+        ),
+        radius_m=float(np.sqrt((mesh.vertices**2).sum(-1).mean())),
+    )
+
+
+def _centre(source: ObjectClass, symmetry: Symmetry) -> Array:
+    """The middle of the bounding box, moved onto the axis of a continuous symmetry: (3,) in the mesh frame."""
+    vertices = source.mesh.vertices
+    middle = np.asarray((vertices.min(0) + vertices.max(0)) / 2.0)
+    if symmetry.free != 1:
+        return symmetry.centre if symmetry.free else middle
+    axis, offset = symmetry.axes[0], symmetry.offsets[0]
+    return np.asarray(offset + (middle - offset) @ axis * axis)
+
+
+def _face_normals(mesh: Mesh) -> Array:
+    """(F, 3) unit normals; zero for degenerate faces."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    n = np.cross(b - a, c - a)
+    length = np.linalg.norm(n, axis=-1, keepdims=True)
+    return np.asarray(n / np.where(length == 0, 1.0, length))
