@@ -19,24 +19,22 @@ from numpy.typing import NDArray
 
 from sequences import layout
 from sequences.camera import Camera
-from sequences.catalogue import Catalogue, ContinuousSymmetry, ObjectClass
+from sequences.catalogue import Catalogue
+from sequences.classes import read_catalogue, read_obj_ids
+from sequences.detections import read_detections
 from sequences.errors import InputError
 from sequences.images import check_size, depth_size, image_size, read_colour, read_depth
 from sequences.jsonfile import Node
-from sequences.meshes import load_mesh
 from sequences.problems import Checks
 from sequences.truth import load_truth
-from sequences.types import Detection, Frame, LocalisationNoise, Run, Visit
+from sequences.types import Frame, LocalisationNoise, Run, Visit
 from sequences.writing import FrameTruth, RunWriter, Sighting
 
 __all__ = ["FrameTruth", "RunWriter", "Sighting", "load_catalogue", "load_run", "load_truth"]
 
 Array = NDArray[np.float64]
 
-DEFAULT_CATEGORY = "unknown"
-DEFAULT_PERSISTENCE_S = 12 * 3600.0
 DEFAULT_RATE_HZ = 30
-_MAX_SCORE = 0.999  # of a detection that comes with one score: nothing it says is certain
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,6 @@ class Description:
     """scene_id -> T_world_visit (4, 4)"""
     up_world: Array | None
     localisation: LocalisationNoise
-    source: str
 
 
 def load_catalogue(root: Path | str) -> Catalogue:
@@ -72,13 +69,15 @@ def read_run(root: Path, scene: int | None, checks: Checks) -> Run:
     """As `load_run`; with gathering checks, a run without the parts that are wrong, for `inspect_run` alone."""
     scenes = layout.find_scenes(root)
     catalogue = Catalogue(())
+    obj_ids: tuple[int, ...] = ()
     with checks.part():
+        obj_ids = read_obj_ids(root)
         catalogue = read_catalogue(root, checks)
     description = None
     with checks.part():
-        description = read_description(root, catalogue, checks)
-    # in a gathering run ctmap.json may be there and broken: its scenes are then taken to be visits all the same
-    listed = tuple(s.scene_id for s in scenes) if description is None else tuple(description.visits)
+        description = read_description(root, obj_ids, checks)
+    # in a gathering run ctmap.json may be there and broken: all scenes are then taken to be visits
+    listed = tuple(() if description is None else description.visits) or tuple(s.scene_id for s in scenes)
     chosen = _choose(root, scenes, listed, scene)
     image_camera = None
     with checks.part():
@@ -86,7 +85,7 @@ def read_run(root: Path, scene: int | None, checks: Checks) -> Run:
     visits = []
     for one in chosen:
         with checks.part():
-            visits.append(_read_visit(one, catalogue, description, image_camera, checks))
+            visits.append(_read_visit(one, obj_ids, description, image_camera, checks))
     ordered: tuple[Visit, ...] = ()
     with checks.part():
         ordered = _in_order_of_time(visits)
@@ -103,76 +102,10 @@ def read_run(root: Path, scene: int | None, checks: Checks) -> Run:
     )
 
 
-# --- what the place is made of ---
+# --- what the place is ---
 
 
-def read_catalogue(root: Path, checks: Checks) -> Catalogue:
-    """The classes, without those that are wrong where `checks` gathers."""
-    info_file = root / layout.MODELS / layout.MODELS_INFO
-    info = Node.read(
-        info_file, "add the models of the classes, as BOP keeps them: models/models_info.json and PLY files"
-    )
-    about_file = root / layout.CATALOGUE
-    about = Node.read(about_file, "") if about_file.is_file() else None
-    if about is None:
-        checks.note(
-            f"{layout.CATALOGUE} is missing: classes are named obj_NNNNNN, of category {DEFAULT_CATEGORY}, "
-            f"persistence {DEFAULT_PERSISTENCE_S / 3600:g} h, movable, and support nothing"
-        )
-    classes = []
-    for key, node in info.members():
-        with checks.part():
-            classes.append(_read_class(root, key, node, None if about is None else about.get(key)))
-    if not classes and not checks.problems:
-        raise info.error("lists no class", "add the models of the classes that may be in the place")
-    return Catalogue(tuple(sorted(classes, key=lambda c: c.obj_id)))
-
-
-def _read_class(root: Path, key: str, info: Node, about: Node | None) -> ObjectClass:
-    if not key.isdigit() or int(key) < 1:
-        raise info.error("the key is not an obj_id", "key each model with its obj_id, a whole number from 1")
-    obj_id = int(key)
-    about = about or Node({}, root / layout.CATALOGUE, key)
-    name, category, persistence = about.get("name"), about.get("category"), about.get("persistence_s")
-    supports, movable = about.get("supports"), about.get("movable")
-    return ObjectClass(
-        obj_id=obj_id,
-        name=f"obj_{obj_id:06d}" if name is None else name.text(),
-        category=DEFAULT_CATEGORY if category is None else category.text(),
-        persistence_s=DEFAULT_PERSISTENCE_S if persistence is None else persistence.positive(),
-        supports=False if supports is None else supports.flag(),
-        movable=True if movable is None else movable.flag(),
-        mesh=load_mesh(root / layout.MODELS / layout.mesh_name(obj_id)),
-        diameter_m=info["diameter"].positive() * layout.MM,
-        symmetries_discrete=_discrete_symmetries(info.get("symmetries_discrete")),
-        symmetries_continuous=_continuous_symmetries(info.get("symmetries_continuous")),
-    )
-
-
-def _discrete_symmetries(node: Node | None) -> Array:
-    motions = [] if node is None else [layout.motion(element) for element in node.elements()]
-    others = [T for T in motions if np.abs(T - np.eye(4)).max() > layout.ROTATION_TOLERANCE]
-    return np.stack([np.eye(4), *others])
-
-
-def _continuous_symmetries(node: Node | None) -> tuple[ContinuousSymmetry, ...]:
-    found = []
-    for element in [] if node is None else node.elements():
-        axis = _unit(element["axis"])
-        offset = element.get("offset")
-        found.append(ContinuousSymmetry(axis, np.zeros(3) if offset is None else offset.numbers(3) * layout.MM))
-    return tuple(found)
-
-
-def _unit(node: Node) -> Array:
-    vector = node.numbers(3)
-    length = float(np.linalg.norm(vector))
-    if length < 1e-9:
-        raise node.error("has no direction", "write a vector that isn't zero")
-    return vector / length
-
-
-def read_description(root: Path, catalogue: Catalogue, checks: Checks) -> Description | None:
+def read_description(root: Path, obj_ids: tuple[int, ...], checks: Checks) -> Description | None:
     """ctmap.json; None, with a note, where there is none."""
     file = root / layout.CTMAP
     if not file.is_file():
@@ -187,24 +120,28 @@ def read_description(root: Path, catalogue: Catalogue, checks: Checks) -> Descri
             f"schema {node['schema'].value}, this version reads {layout.SCHEMA}",
             "convert the run, or update the program",
         )
-    _check_score_order(node["score_order"], catalogue)
-    robot = node.get("T_robot_camera")
-    if robot is not None:
-        layout.motion(robot)
-    up = node.get("up_world")
-    source = node.get("source")
-    return Description(
-        visits=_read_visits(node["visits"]),
-        up_world=None if up is None else _unit(up),
-        localisation=_read_localisation(node.get("localisation")),
-        source="" if source is None else source.text(),
-    )
+    visits: dict[int, Array] = {}
+    up_world, localisation = None, LocalisationNoise()
+    with checks.part():
+        _check_score_order(node["score_order"], obj_ids)
+    with checks.part():
+        visits = _read_visits(node["visits"])
+    with checks.part():
+        up = node.get("up_world")
+        up_world = None if up is None else layout.unit(up)
+    with checks.part():
+        localisation = _read_localisation(node.get("localisation"))
+    with checks.part():
+        robot = node.get("T_robot_camera")
+        if robot is not None:
+            layout.motion(robot)
+    return Description(visits, up_world, localisation)
 
 
-def _check_score_order(node: Node, catalogue: Catalogue) -> None:
-    expected = [layout.BACKGROUND, *catalogue.obj_ids]
+def _check_score_order(node: Node, obj_ids: tuple[int, ...]) -> None:
+    expected = [layout.BACKGROUND, *obj_ids]
     found = [element.value for element in node.elements()]
-    if len(catalogue) and found != expected:
+    if obj_ids and found != expected:
         raise node.error("not the background and then the catalogue's obj_ids, ascending", f"write {expected}")
 
 
@@ -292,7 +229,7 @@ def _read_camera(root: Path, *, required: bool, checks: Checks) -> _ImageCamera:
 
 def _read_visit(
     scene: layout.Scene,
-    catalogue: Catalogue,
+    obj_ids: tuple[int, ...],
     description: Description | None,
     image_camera: _ImageCamera | None,
     checks: Checks,
@@ -305,7 +242,7 @@ def _read_visit(
     T_world_visit = np.eye(4) if description is None else description.visits.get(scene.scene_id, np.eye(4))
     poses = _poses(scene, entries, required=description is not None, checks=checks)
     times = _times(scene, entries, alone=description is None or len(description.visits) == 1, checks=checks)
-    detections = _read_detections(scene, catalogue, set(entries), checks)
+    detections = read_detections(scene, obj_ids, set(entries), checks)
     depths = layout.images_in(scene.folder / layout.DEPTH)
     colours = _colours(scene, checks)
     _check_unlisted(scene, depths, entries, checks)
@@ -441,85 +378,6 @@ def _check_unlisted(scene: layout.Scene, depths: Iterable[int], entries: dict[in
             field=str(unlisted[0]),
             remedy="add their entries, or remove the images",
         )
-
-
-# --- detections ---
-
-
-def _read_detections(
-    scene: layout.Scene, catalogue: Catalogue, im_ids: set[int], checks: Checks
-) -> dict[int, tuple[Detection, ...]]:
-    """Detections by image, in an order that doesn't depend on the file's."""
-    file = scene.folder / layout.SCENE_DETECTIONS
-    if not file.is_file():
-        checks.note(f"scene {scene.scene_id} has no {layout.SCENE_DETECTIONS}: there are no detections")
-        return {}
-    found: dict[int, list[Detection]] = {}
-    elements: list[Node] = []
-    with checks.part():
-        elements = Node.read(file, "").elements()
-    derived = 0
-    for node in elements:
-        with checks.part():
-            im_id = _check_place(node, scene, im_ids)
-            box = _box(node["bbox"])
-            scores, was_derived = _class_scores(node, catalogue)
-            derived += was_derived
-            found.setdefault(im_id, []).append(Detection(box, scores))
-    if derived:
-        checks.note(
-            f"{derived} detections of scene {scene.scene_id} have no class_scores: the score goes to category_id, "
-            "the rest is shared equally by background and the other classes"
-        )
-    return {im_id: tuple(sorted(some, key=_canonical)) for im_id, some in found.items()}
-
-
-def _canonical(detection: Detection) -> tuple[float, ...]:
-    return (*detection.box, *detection.class_scores.tolist())
-
-
-def _check_place(node: Node, scene: layout.Scene, im_ids: set[int]) -> int:
-    scene_id = node.get("scene_id")
-    if scene_id is not None and scene_id.integer() != scene.scene_id:
-        raise scene_id.error(f"a detection of scene {scene_id.value} in scene {scene.scene_id}", "move it to its scene")
-    im_id = node["image_id"].integer()
-    if im_id not in im_ids:
-        raise node["image_id"].error(
-            f"image {im_id} is not in {layout.SCENE_CAMERA}", "remove the detection, or add the image"
-        )
-    return im_id
-
-
-def _box(node: Node) -> tuple[float, float, float, float]:
-    x, y, width, height = node.numbers(4).tolist()
-    if width <= 0 or height <= 0:
-        raise node.error("the box has no area", "write x, y, width, height in pixels, or remove the detection")
-    return (x, y, width, height)
-
-
-def _class_scores(node: Node, catalogue: Catalogue) -> tuple[Array, bool]:
-    """(C + 1,) scores that sum to 1, and whether they had to be derived from one score."""
-    given, category = node.get("class_scores"), node.get("category_id")
-    if category is not None and len(catalogue) and category.integer() not in catalogue:
-        raise category.error(
-            f"unknown obj_id {category.value}", "add its model to models/, or remove the detections of this class"
-        )
-    n = len(catalogue) + 1
-    if given is not None:
-        scores = given.numbers(n if len(catalogue) else None)
-        if scores.min() < 0 or scores.sum() <= 0:
-            raise given.error(
-                "scores below zero, or all zero", "write probabilities: background, then obj_ids ascending"
-            )
-        return scores / scores.sum(), False
-    score = node["score"].number()
-    if not 0 <= score <= 1:
-        raise node["score"].error(f"score {score:g} is not in [0, 1]", "write a probability, or add class_scores")
-    score = min(score, _MAX_SCORE)
-    scores = np.full(n, (1.0 - score) / max(n - 1, 1))
-    if len(catalogue):
-        scores[1 + catalogue.index(node["category_id"].integer())] = score
-    return scores, True
 
 
 # --- the whole ---

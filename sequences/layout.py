@@ -117,6 +117,15 @@ def images_in(folder: Path) -> dict[int, Path]:
     return {int(p.stem): p for p in files}
 
 
+def unit(node: Node) -> Array:
+    """Three numbers -> the unit vector (3,) along them."""
+    vector = node.numbers(3)
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise node.error("has no direction", "write a vector that isn't zero")
+    return vector / length
+
+
 def rotation(node: Node) -> Array:
     """Nine numbers -> the nearest rotation (3, 3); rounding to four digits is forgiven."""
     R = node.numbers(9).reshape(3, 3)

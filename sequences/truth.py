@@ -6,7 +6,7 @@ BOP's scene_gt.json says T_camera_object for the true camera, so T_world_object 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +32,7 @@ class _Sighting:
     frame: int
     T_world_object: Array
     visible_fraction: float
+    file: Path
 
 
 def load_truth(run: Run) -> Truth | None:
@@ -45,10 +46,10 @@ def load_truth(run: Run) -> Truth | None:
     Raises:
         InputError: broken files; unknown obj_id; an inst_id that names two objects of one frame, or two classes.
     """
-    return read_truth(run, Checks())
+    return read_truth(run, run.catalogue.obj_ids, Checks())
 
 
-def read_truth(run: Run, checks: Checks) -> Truth | None:
+def read_truth(run: Run, obj_ids: Collection[int], checks: Checks) -> Truth | None:
     """As `load_truth`; with gathering checks, the truth without the frames that are wrong, for `inspect_run` alone."""
     cameras = np.stack([frame.T_world_camera for frame in run.frames]) if run.frames else np.zeros((0, 4, 4))
     sightings: list[_Sighting] = []
@@ -62,7 +63,7 @@ def read_truth(run: Run, checks: Checks) -> Truth | None:
         if (folder / layout.SCENE_GT).is_file():
             found = True
             with checks.part():
-                sightings += _sightings(folder, v, visit, run, cameras, checks)
+                sightings += _sightings(folder, v, visit, obj_ids, cameras, checks)
     return Truth(_objects(sightings, checks), cameras) if found else None
 
 
@@ -82,7 +83,9 @@ def _true_cameras(folder: Path, visit: Visit, checks: Checks) -> Array:
     return poses
 
 
-def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array, checks: Checks) -> list[_Sighting]:
+def _sightings(
+    folder: Path, v: int, visit: Visit, obj_ids: Collection[int], cameras: Array, checks: Checks
+) -> list[_Sighting]:
     entries = layout.image_entries(Node.read(folder / layout.SCENE_GT, ""))
     visible = _visible_fractions(folder)
     found: list[_Sighting] = []
@@ -98,7 +101,7 @@ def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array, che
         in_frame: set[tuple[int, ...]] = set()
         for k, element in enumerate(elements):
             with checks.part():
-                sighting = _sighting(element, frame, run, cameras, key, visible(frame.im_id, k))
+                sighting = _sighting(element, frame, obj_ids, cameras, key, visible(frame.im_id, k))
                 if sighting.key in in_frame:
                     raise element["inst_id"].error("names two objects of one frame", "give each object its own inst_id")
                 in_frame.add(sighting.key)
@@ -107,13 +110,18 @@ def _sightings(folder: Path, v: int, visit: Visit, run: Run, cameras: Array, che
 
 
 def _sighting(
-    node: Node, frame: Frame, run: Run, cameras: Array, key: Callable[[Node, int], tuple[int, ...]], visible: float
+    node: Node,
+    frame: Frame,
+    obj_ids: Collection[int],
+    cameras: Array,
+    key: Callable[[Node, int], tuple[int, ...]],
+    visible: float,
 ) -> _Sighting:
     obj_id = node["obj_id"].integer()
-    if obj_id not in run.catalogue:
+    if obj_id not in obj_ids:
         raise node["obj_id"].error(f"unknown obj_id {obj_id}", "add its model to models/, or remove the entry")
     T_camera_object = se3.make(layout.rotation(node["cam_R_m2c"]), node["cam_t_m2c"].numbers(3) * layout.MM)
-    return _Sighting(key(node, obj_id), obj_id, frame.index, cameras[frame.index] @ T_camera_object, visible)
+    return _Sighting(key(node, obj_id), obj_id, frame.index, cameras[frame.index] @ T_camera_object, visible, node.file)
 
 
 def _named(node: Node, obj_id: int) -> tuple[int, ...]:
@@ -170,7 +178,7 @@ def _object(inst_id: int, sightings: list[_Sighting]) -> TrueObject:
     if len(obj_ids) > 1:
         raise InputError(
             f"inst_id {inst_id} is of classes {obj_ids}",
-            file=layout.SCENE_GT,
+            file=sightings[-1].file,
             field="inst_id",
             remedy="give each physical object an inst_id of its own",
         )

@@ -15,6 +15,7 @@ import numpy as np
 from sequences import layout
 from sequences.bop import read_run
 from sequences.catalogue import ObjectClass
+from sequences.classes import read_obj_ids
 from sequences.meshes import diameter
 from sequences.problems import Checks, Problem
 from sequences.truth import read_truth
@@ -125,7 +126,7 @@ def inspect_run(path: Path | str, scene: int | None = None) -> Inspection:
     facts = None
     with checks.part():
         run = read_run(root, scene, checks)
-        truth = read_truth(run, checks)
+        truth = read_truth(run, read_obj_ids(root), checks)
         _check_meshes(run, checks)
         for frame in run.frames:
             _check_images(frame, checks)

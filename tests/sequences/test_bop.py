@@ -315,6 +315,13 @@ def test_plain_bop_without_poses_or_camera_file_loads(tmp_path):
     assert any("camera.json" in note for note in run.notes)
 
 
+def test_a_class_that_the_catalogue_does_not_list_gets_defaults_that_are_said(tiny_run):
+    edit(tiny_run / "catalogue.json", lambda catalogue: catalogue.pop("5"))
+    run = load_run(tiny_run)
+    assert [c.category for c in run.catalogue.classes] == ["food", "unknown", "furniture"]
+    assert any("lists no class 5" in note for note in run.notes)
+
+
 def test_another_name_for_the_only_split_is_taken(tiny_run):
     (tiny_run / "test").rename(tiny_run / "val")
     assert len(load_run(tiny_run).frames) == 6
