@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.evaluation import pose
-from ctmap_gtsam.evaluation.matching import ObjectFrames, match
+from ctmap_gtsam.evaluation.detection import class_probability
+from ctmap_gtsam.evaluation.matching import MethodMap, match
 from ctmap_gtsam.evaluation.pose import Shape
 
 Array = NDArray[np.float64]
@@ -35,11 +35,12 @@ class ObjectAgreement:
     not visible"""
     rotation_rad: Array
     """(F,) symmetry-aware; inf where the classes differ, NaN where not visible"""
-
-    @property
-    def final_class(self) -> int:
-        """The reference's class in the last frame that has one."""
-        return int(self.reference_class[self.reference_class >= 0][-1])
+    final_class: int
+    """the reference's class in the last frame that has one"""
+    reference_probability: Array
+    """(F,) P(exists) P(final_class) in the reference"""
+    other_probability: Array
+    """(F,) the same in the other method"""
 
     @property
     def class_agreement(self) -> float:
@@ -48,7 +49,7 @@ class ObjectAgreement:
 
     @property
     def first_agreement(self) -> int | None:
-        """The first visible frame from which on the other never leaves the reference's class; None where it never agrees."""
+        """The first visible frame after which the other keeps the reference's class; None where there is none."""
         frames = np.flatnonzero(self.visible)
         differs = np.flatnonzero(self.reference_class[frames] != self.other_class[frames])
         after = 0 if len(differs) == 0 else differs[-1] + 1
@@ -67,7 +68,7 @@ class Agreement:
     """object_ids that the reference doesn't have"""
 
     def metrics(self) -> dict[str, float]:
-        """Over all object-frames of the reference in view; NaN where there are none, inf where the median is missing."""
+        """Over the object-frames the reference has in view; NaN where it has none, inf where half have no match."""
         distance = np.concatenate([o.distance_m[o.visible] for o in self.objects] or [np.zeros(0)])
         rotation = np.concatenate([o.rotation_rad[o.visible] for o in self.objects] or [np.zeros(0)])
         same = np.concatenate([(o.reference_class == o.other_class)[o.visible] for o in self.objects] or [np.zeros(0)])
@@ -81,33 +82,40 @@ class Agreement:
         }
 
 
-def agree(
-    reference: tuple[str, ObjectFrames], other: tuple[str, ObjectFrames], shapes: dict[int, Shape]
-) -> Agreement:
+def agree(reference: MethodMap, other: MethodMap, shapes: dict[int, Shape]) -> Agreement:
     """Match two methods by the same function that matches a method to the truth, and measure how far they are apart."""
-    (reference_name, ours), (other_name, theirs) = reference, other
-    matching = match(ours, theirs, shapes)
-    objects = tuple(_pairs(ours, theirs, matching.row, shapes))
-    return Agreement(reference_name, other_name, objects, tuple(int(theirs.name[m]) for m in matching.unmatched))
+    matching = match(reference.objects, other.objects, shapes)
+    pairs = enumerate(int(row) for row in matching.row)
+    objects = tuple(_pair(reference, n, other, m, shapes) for n, m in pairs if reference.objects.visible[n].any())
+    only_in_other = tuple(int(other.objects.name[m]) for m in matching.unmatched)
+    return Agreement(reference.name, other.name, objects, only_in_other)
 
 
-def _pairs(
-    ours: ObjectFrames, theirs: ObjectFrames, rows: Ints, shapes: dict[int, Shape]
-) -> Iterator[ObjectAgreement]:
-    absent = np.full(ours.class_id.shape[1], -1, dtype=np.int64)
-    for n, row in enumerate(rows):
-        visible = ours.visible[n]
-        if not visible.any():
-            continue
-        classes = theirs.class_id[row] if row >= 0 else absent
-        distance, rotation = (np.where(visible, np.inf, np.nan) for _ in range(2))
-        pairs = np.stack([ours.class_id[n], classes], axis=1)
-        both = visible & (classes >= 0)
-        for a, b in np.unique(pairs[both], axis=0):
-            f = both & (pairs == (a, b)).all(axis=1)
-            mine, yours = ours.T_camera_object[n, f], theirs.T_camera_object[row, f]
-            distance[f] = pose.translation_error(shapes[int(b)], yours, shapes[int(a)], mine)
-            if a == b:
-                rotation[f] = pose.rotation_error(shapes[int(a)], yours, mine)
-        other = int(theirs.name[row]) if row >= 0 else None
-        yield ObjectAgreement(int(ours.name[n]), other, visible, ours.class_id[n], classes, distance, rotation)
+def _pair(reference: MethodMap, n: int, other: MethodMap, m: int, shapes: dict[int, Shape]) -> ObjectAgreement:
+    """Object n of the reference and object m of the other method, -1 where that has none."""
+    ours, theirs = reference.objects, other.objects
+    visible, classes = ours.visible[n], ours.class_id[n]
+    other_classes = theirs.class_id[m] if m >= 0 else np.full_like(classes, -1)
+    distance, rotation = (np.where(visible, np.inf, np.nan) for _ in range(2))
+    pairs = np.stack([classes, other_classes], axis=1)
+    both = visible & (other_classes >= 0)
+    for a, b in np.unique(pairs[both], axis=0):
+        f = both & (pairs == (a, b)).all(axis=1)
+        mine, yours = ours.T_camera_object[n, f], theirs.T_camera_object[m, f]
+        distance[f] = pose.translation_error(shapes[int(b)], yours, shapes[int(a)], mine)
+        if a == b:
+            rotation[f] = pose.rotation_error(shapes[int(a)], yours, mine)
+    final = int(classes[classes >= 0][-1])
+    asked = np.full_like(classes, final)
+    return ObjectAgreement(
+        reference_object=int(ours.name[n]),
+        other_object=int(theirs.name[m]) if m >= 0 else None,
+        visible=visible,
+        reference_class=classes,
+        other_class=other_classes,
+        distance_m=distance,
+        rotation_rad=rotation,
+        final_class=final,
+        reference_probability=class_probability(reference, n, asked),
+        other_probability=class_probability(other, m, asked),
+    )

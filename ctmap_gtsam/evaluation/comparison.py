@@ -1,9 +1,9 @@
 """Methods side by side on one run: every metric of every method, from their estimates alone.
 
-A method is judged by each frame's own estimate. Over all visible true object-frames: a true object that nothing matches, or
-whose match is absent in the frame, has infinite error; so has, in all that compares meshes, a match of the wrong class
-(its pose is in another mesh's frame), while its translation, between the boxes' centres, stays finite. A median is
-infinite where half of the object-frames are; in JSON, which knows no infinity, that is null.
+A method is judged by each frame's own estimate, over all visible true object-frames. A true object that nothing
+matches, or whose match is absent in the frame, has infinite error. So has, in all that compares meshes, a match of the
+wrong class (its pose is in another mesh's frame), while its translation, between the boxes' centres, stays finite.
+A median is infinite where half of the object-frames are; in JSON, which knows no infinity, that is null.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation import detection, pose
 from ctmap_gtsam.evaluation.agreement import Agreement, agree
-from ctmap_gtsam.evaluation.matching import Matching, ObjectFrames, from_estimate, from_truth, match, shapes_of
+from ctmap_gtsam.evaluation.matching import (
+    Matching,
+    MethodMap,
+    ObjectFrames,
+    from_estimate,
+    from_truth,
+    match,
+    shapes_of,
+)
 from ctmap_gtsam.evaluation.pose import Shape
 from sequences.catalogue import Catalogue
 from sequences.truth import load_truth
@@ -45,8 +53,8 @@ METRICS = (
     "class_accuracy",
     "class_accuracy_last_half",
 )
-"""Taken over the visible true object-frames, of all objects and of each; posed_share is the share of them with a pose of
-the true class, class_accuracy_last_half that of the second half of the run's frames"""
+"""Taken over the visible true object-frames, of all objects and of each. posed_share: how many of them have a pose of
+the true class. class_accuracy_last_half: over the second half of the run's frames"""
 
 COUNTS = ("missed_objects", "false_positive_objects")
 """True objects, visible somewhere, that nothing matches; estimated objects, existing somewhere, that match nothing"""
@@ -54,7 +62,7 @@ COUNTS = ("missed_objects", "false_positive_objects")
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """One method at every true object (N) in every frame (F); inf where it has no answer, NaN where nothing is asked."""
+    """One method at every true object (N) and frame (F): inf where it has no answer, NaN where nothing is asked."""
 
     class_id: Ints
     """(N, F) what the method says, -1 where it says nothing"""
@@ -95,12 +103,18 @@ class Comparison:
     """name of the run"""
     time_s: Array
     """(F,) since the first frame"""
+    visit: Ints
+    """(F,) row of Run.visits"""
     labels: tuple[str, ...]
     """(N,) the true objects' names: their class, and #inst_id where there are several"""
+    class_names: Mapping[int, str]
+    """obj_id -> name"""
     truth: ObjectFrames | None
     methods: Mapping[str, MethodScore]
+    reference: str | None
+    """the method that the others with poses are held to: REFERENCE where it ran, else the last; None without any"""
     agreement: Mapping[str, Agreement]
-    """each method with poses held to the reference method"""
+    """each other method with poses held to the reference method"""
 
     def table(self) -> pd.DataFrame:
         """One row a method, one column a metric."""
@@ -143,15 +157,26 @@ def compare(run: Run, estimates: Mapping[str, Estimate], detector: bool = True) 
     """
     shapes = shapes_of(run.catalogue)
     truth = load_truth(run)
-    reference = None if truth is None else from_truth(run, truth)
-    labels = () if reference is None else object_labels(run.catalogue, reference)
-    maps = {name: from_estimate(run, estimate) for name, estimate in estimates.items()}
-    methods = {DETECTOR: _score_detector(run, reference, labels)} if detector else {}
-    for name, estimate in estimates.items():
-        methods[name] = _score(run, estimate, maps[name], reference, labels, shapes)
+    true_objects = None if truth is None else from_truth(run, truth)
+    labels = () if true_objects is None else object_labels(run.catalogue, true_objects)
+    maps = {name: from_estimate(run, name, estimate) for name, estimate in estimates.items()}
+    methods = {DETECTOR: _score_detector(run, true_objects, labels)} if detector else {}
+    methods |= {name: _score(one, true_objects, labels, shapes) for name, one in maps.items()}
+    reference = REFERENCE if REFERENCE in maps else next(reversed(maps), None)
     times = np.array([frame.time_ns for frame in run.frames], dtype=np.int64)
-    time_s = (times - times[0]) * 1e-9 if len(times) else np.zeros(0)
-    return Comparison(run.name, time_s, labels, reference, methods, _agreements(maps, shapes))
+    return Comparison(
+        run=run.name,
+        time_s=np.asarray((times - times[:1]) * 1e-9, dtype=np.float64),
+        visit=np.array([frame.visit for frame in run.frames], dtype=np.int64),
+        labels=labels,
+        class_names={c.obj_id: c.name for c in run.catalogue.classes},
+        truth=true_objects,
+        methods=methods,
+        reference=reference,
+        agreement={name: agree(maps[reference], other, shapes) for name, other in maps.items() if name != reference}
+        if reference is not None
+        else {},
+    )
 
 
 def object_labels(catalogue: Catalogue, truth: ObjectFrames) -> tuple[str, ...]:
@@ -163,33 +188,18 @@ def object_labels(catalogue: Catalogue, truth: ObjectFrames) -> tuple[str, ...]:
     )
 
 
-def _agreements(maps: Mapping[str, ObjectFrames], shapes: dict[int, Shape]) -> dict[str, Agreement]:
-    if not maps:
-        return {}
-    reference = REFERENCE if REFERENCE in maps else list(maps)[-1]
-    return {
-        name: agree((reference, maps[reference]), (name, other), shapes)
-        for name, other in maps.items()
-        if name != reference
-    }
-
-
 def _score(
-    run: Run,
-    estimate: Estimate,
-    candidates: ObjectFrames,
-    truth: ObjectFrames | None,
-    labels: tuple[str, ...],
-    shapes: dict[int, Shape],
+    method: MethodMap, truth: ObjectFrames | None, labels: tuple[str, ...], shapes: dict[int, Shape]
 ) -> MethodScore:
+    estimate = method.estimate
     own = {
         "existing_objects_final": int(estimate.exists[:, -1].sum()) if len(estimate.keyframe_frame) else 0,
         "hypotheses_scored": estimate.meta.get("diagnostics", {}).get("hypotheses_scored"),
     }
     if truth is None:
         return MethodScore({**dict.fromkeys((*METRICS, *COUNTS)), **own, "objects": {}}, None, None)
-    matching = match(truth, candidates, shapes)
-    errors = _frame_errors(run, estimate, candidates, truth, matching, shapes)
+    matching = match(truth, method.objects, shapes)
+    errors = _frame_errors(method, truth, matching, shapes)
     counts = {
         "missed_objects": int(((matching.row < 0) & truth.visible.any(axis=1)).sum()),
         "false_positive_objects": len(matching.unmatched),
@@ -198,17 +208,8 @@ def _score(
     return MethodScore(metrics, errors, matching)
 
 
-def _frame_errors(
-    run: Run,
-    estimate: Estimate,
-    candidates: ObjectFrames,
-    truth: ObjectFrames,
-    matching: Matching,
-    shapes: dict[int, Shape],
-) -> FrameErrors:
-    said = detection.matched_class(candidates, matching)
-    correct = detection.class_correct(truth, candidates, matching)
-    held = np.array([estimate.at(frame.time_ns).keyframe for frame in run.frames], dtype=np.int64)
+def _frame_errors(method: MethodMap, truth: ObjectFrames, matching: Matching, shapes: dict[int, Shape]) -> FrameErrors:
+    said = detection.matched_class(method.objects, matching)
     translation, rotation, mssd, add, adds = (np.where(truth.visible, np.inf, np.nan) for _ in range(5))
     for n, row in enumerate(matching.row):
         for true_id, said_id in np.unique(np.stack([truth.class_id[n], said[n]], axis=1), axis=0):
@@ -216,15 +217,18 @@ def _frame_errors(
             if said_id < 0 or not f.any():
                 continue
             true, other = shapes[int(true_id)], shapes[int(said_id)]
-            T_true, T = truth.T_camera_object[n, f], candidates.T_camera_object[row, f]
+            T_true, T = truth.T_camera_object[n, f], method.objects.T_camera_object[row, f]
             translation[n, f] = pose.translation_error(other, T, true, T_true)
             if said_id == true_id:
                 rotation[n, f] = pose.rotation_error(true, T, T_true)
                 mssd[n, f], add[n, f], adds[n, f] = (e(true, T, T_true) for e in (pose.mssd, pose.add, pose.adds))
+    probability = [
+        detection.class_probability(method, int(row), truth.class_id[n]) for n, row in enumerate(matching.row)
+    ]
     return FrameErrors(
         class_id=said,
-        class_correct=correct,
-        class_probability=detection.class_probability(estimate, held, matching, truth.class_id),
+        class_correct=detection.class_correct(truth, method.objects, matching),
+        class_probability=np.array(probability).reshape(truth.visible.shape),
         translation_m=translation,
         rotation_rad=rotation,
         mssd_m=mssd,

@@ -1,8 +1,8 @@
 """Whether the objects that are there are called what they are.
 
-Class accuracy is the share of visible true object-frames whose matched estimate exists and has the true class as its most
-probable one. The detector, which has boxes and no objects, is asked the same: its box must overlap the true object's by
-IoU >= 0.5 (PASCAL VOC; Everingham et al., IJCV 2010) and its best class be the true one.
+Class accuracy is the share of visible true object-frames whose matched estimate exists and has the true class as its
+most probable one. The detector, which has boxes and no objects, is asked the same: its box must overlap the true
+object's by IoU >= 0.5 (PASCAL VOC; Everingham et al., IJCV 2010) and its best class be the true one.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.evaluation.matching import Matching, ObjectFrames
+from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
 from ctmap_gtsam.evaluation.silhouettes import silhouettes
+from sequences.camera import Camera
 from sequences.catalogue import Catalogue
 from sequences.types import Detection, Run
 
@@ -50,29 +50,16 @@ def matched_class(estimate: ObjectFrames, matching: Matching) -> NDArray[np.int6
     return out
 
 
-def class_probability(
-    estimate: Estimate, held: NDArray[np.int64], matching: Matching, class_id: NDArray[np.int64]
-) -> Array:
-    """(N, F) P(exists) P(class) that the match gives to a class.
-
-    Args:
-        estimate: the method's own answer.
-        held: (F,) the keyframe that each frame is held from.
-        matching: N objects.
-        class_id: (N, F) the class asked for, -1 for none.
-
-    Returns:
-        0 where the object has no match or no such class.
-    """
-    out = np.zeros(class_id.shape)
-    column = {int(c): k for k, c in enumerate(estimate.class_ids)}
-    for n, row in enumerate(matching.row):
-        if row < 0:
-            continue
-        columns = np.array([column.get(int(c), -1) for c in class_id[n]])
-        known = columns >= 0
-        k = held[known]
-        out[n, known] = estimate.existence[row, k] * estimate.class_probability[row, k, columns[known]]
+def class_probability(method: MethodMap, row: int, class_id: NDArray[np.int64]) -> Array:
+    """(F,) P(exists) P(class) of a method's object `row` for classes (F,); 0 where either is -1, for none."""
+    out = np.zeros(len(class_id))
+    if row < 0:
+        return out
+    column = {int(c): k for k, c in enumerate(method.estimate.class_ids)}
+    columns = np.array([column.get(int(c), -1) for c in class_id], dtype=np.int64)
+    known = columns >= 0
+    k = method.held[known]
+    out[known] = method.estimate.existence[row, k] * method.estimate.class_probability[row, k, columns[known]]
     return out
 
 
@@ -111,7 +98,7 @@ def iou(ours: Array, theirs: Array) -> Array:
     return shared / np.where(union > 0, union, 1.0)
 
 
-def _true_boxes(catalogue: Catalogue, truth: ObjectFrames, f: int, camera) -> tuple[NDArray[np.int64], Array]:
+def _true_boxes(catalogue: Catalogue, truth: ObjectFrames, f: int, camera: Camera) -> tuple[NDArray[np.int64], Array]:
     """Rows of the true objects that count in frame f, and the boxes (n, 4) of their visible pixels."""
     present = np.flatnonzero(truth.present[:, f])
     drawn = silhouettes(catalogue, truth.class_id[present, f], truth.T_camera_object[present, f], camera)

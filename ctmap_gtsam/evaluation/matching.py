@@ -1,13 +1,13 @@
 """The one matching of estimated objects to true ones (or to another method's), which every metric rests on.
 
-Both sides become `ObjectFrames`: where each object is in each frame's own camera. Poses are compared there, as BOP does:
-``inv(T_world_camera) T_world_object`` with each side's own camera, so a localisation error that object and camera
+Both sides become `ObjectFrames`: where each object is in each frame's own camera. Poses are compared there, as BOP
+does: ``inv(T_world_camera) T_world_object`` with each side's own camera, so a localisation error that object and camera
 share costs nothing, and one that moves the object in the picture does.
 
 There is one assignment a place (Kuhn, 1955; scipy's linear_sum_assignment), over all visits at once. It is blind to the
-class, so that a wrong class at the right place is a wrong class and not a miss. The cost of a pair is the distance of the
-bounding boxes' centres, at most `reach`, summed over the frames where the reference object is visible; being absent
-costs the full reach. A pair that is never within reach of each other is no pair.
+class, so that a wrong class at the right place is a wrong class and not a miss. The cost of a pair is the distance of
+the bounding boxes' centres over the reach, at most 1, summed over the frames where the reference object is visible;
+being absent costs 1. Two objects that are never within reach of each other are no pair.
 """
 
 from __future__ import annotations
@@ -59,6 +59,16 @@ class ObjectFrames:
         return self.class_id >= 0
 
 
+class MethodMap(NamedTuple):
+    """A method's answer, seen from every frame of the run."""
+
+    name: str
+    estimate: Estimate
+    objects: ObjectFrames
+    held: Ints
+    """(F,) the keyframe whose map each frame shows"""
+
+
 class Matching(NamedTuple):
     """Rows of the candidates for the rows of the reference."""
 
@@ -90,17 +100,18 @@ def from_truth(run: Run, truth: Truth) -> ObjectFrames:
     return ObjectFrames(np.array([t.inst_id for t in truth.objects], dtype=np.int64), class_id, poses, visible)
 
 
-def from_estimate(run: Run, estimate: Estimate) -> ObjectFrames:
+def from_estimate(run: Run, name: str, estimate: Estimate) -> MethodMap:
     """What a method says, in its own cameras; visible where the object exists and is in view at the held keyframe."""
     shape = (len(estimate.object_id), len(run.frames))
     class_id, visible = np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=np.bool_)
-    poses = np.full((*shape, 4, 4), np.nan)
+    poses, held = np.full((*shape, 4, 4), np.nan), np.zeros(shape[1], dtype=np.int64)
     for f, snapshot in enumerate(snapshots(run.frames, estimate)):
         rows = snapshot.objects
+        held[f] = snapshot.keyframe
         class_id[rows, f] = snapshot.class_id
         poses[rows, f] = se3.inverse(snapshot.T_world_camera) @ snapshot.T_world_object
         visible[rows, f] = estimate.in_view[rows, snapshot.keyframe]
-    return ObjectFrames(estimate.object_id, class_id, poses, visible)
+    return MethodMap(name, estimate, ObjectFrames(estimate.object_id, class_id, poses, visible), held)
 
 
 def centres(objects: ObjectFrames, shapes: dict[int, Shape]) -> Array:

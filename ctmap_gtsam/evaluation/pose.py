@@ -4,8 +4,8 @@ Every function takes batches of two poses of one object in one frame of referenc
 number a pair: metres or radians. With a symmetry S of the class, ``T_true S`` is as true as ``T_true``.
 
 Sources: Hodan et al., BOP Challenge 2020 on 6D Object Localization (ECCV Workshops 2020), for MSSD and for turning
-continuous symmetries into steps; Hinterstoisser et al., Model Based Training, Detection and Pose Estimation (ACCV 2012),
-for ADD and ADD-S (there for objects with "indistinguishable views"; ADI in BOP).
+continuous symmetries into steps; Hinterstoisser et al., Model Based Training, Detection and Pose Estimation (ACCV
+2012), for ADD and ADD-S (there for objects with indistinguishable views; ADI in BOP).
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def _nearest_twin(shape: Shape, T_estimated: Array, T_true: Array) -> tuple[Arra
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _least_maximum(maps, points):
-    """Maps (N, S, 3, 4) on points (H, 3) -> min over S of max over H of the length of the image, and its S: (N,) each."""
+    """Maps (N, S, 3, 4), points (H, 3) -> min over S of max over H of the image's length, and its S: (N,) each."""
     out, index = np.empty(maps.shape[0]), np.zeros(maps.shape[0], np.int64)
     for n in range(maps.shape[0]):
         least = np.inf

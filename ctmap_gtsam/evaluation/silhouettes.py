@@ -36,7 +36,7 @@ class Silhouette(NamedTuple):
 def silhouettes(
     catalogue: Catalogue, class_id: Sequence[int] | NDArray[np.int64], T_camera_object: Array, camera: Camera
 ) -> list[Silhouette]:
-    """Draw n objects of the map, obj_ids (n,) at poses (n, 4, 4), into one camera; clutter without a mesh hides nothing."""
+    """Draw n objects of a map, obj_ids (n,) at poses (n, 4, 4), into one camera. Only they hide each other."""
     drawn = [_draw(catalogue[int(c)].mesh, T, camera) for c, T in zip(class_id, T_camera_object, strict=True)]
     nearest = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     for window, depth in drawn:
@@ -67,9 +67,7 @@ def _window(mesh: Mesh, T: Array, camera: Camera) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def _silhouette(
-    window: tuple[slice, slice], depth: NDArray[np.float32], nearest: NDArray[np.float32]
-) -> Silhouette:
+def _silhouette(window: tuple[slice, slice], depth: NDArray[np.float32], nearest: NDArray[np.float32]) -> Silhouette:
     covered = np.isfinite(depth)
     visible = covered & (depth <= nearest[window])
     if not visible.any():

@@ -1,4 +1,4 @@
-"""BOP's results of 6D localisation: one CSV line an object and image (bop.felk.cvut.cz/challenges, "Format of results")."""
+"""BOP's results of 6D localisation, one CSV line an object and image (bop.felk.cvut.cz/challenges)."""
 
 from __future__ import annotations
 

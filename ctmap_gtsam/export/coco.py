@@ -34,9 +34,7 @@ def coco_detections(run: Run) -> list[Result]:
         for detection in frame.detections:
             best = int(np.argmax(detection.class_scores[1:]))
             score = float(detection.class_scores[1 + best])
-            out.append(
-                _result(frame.scene_id, frame.im_id, run.catalogue.obj_ids[best], detection.box, score, None)
-            )
+            out.append(_result(frame.scene_id, frame.im_id, run.catalogue.obj_ids[best], detection.box, score, None))
     return out
 
 

@@ -1,0 +1,22 @@
+"""What became of a method that was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ctmap_gtsam.estimate import Estimate
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One method on one run."""
+
+    status: Literal["ok", "skipped"]
+    """skipped: it can't run here; `reason` and `remedy` say why and what would help"""
+    seconds: float | None = None
+    """wall-clock time of the method; None where it didn't run"""
+    estimate: Estimate | None = None
+    """None where it didn't run, and for the detector, which has no poses"""
+    reason: str = ""
+    remedy: str = ""

@@ -1,0 +1,188 @@
+"""The tables of a report: what is in a column, how it is written, which way is better."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ctmap_gtsam.evaluation.agreement import Agreement, ObjectAgreement
+from ctmap_gtsam.evaluation.comparison import Comparison
+from ctmap_gtsam.evaluation.outcome import Outcome
+
+NOTHING = "–"
+
+MOVED_M = 0.01
+"""A pose that hindsight puts further off than this is worth pointing at"""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One metric in a table."""
+
+    key: str
+    title: str
+    unit: str
+    style: str
+    """of format()"""
+    better: Literal["low", "high", ""]
+    meaning: str
+    scale: float = 1
+
+    def text(self, value: float | None) -> str:
+        """The value as it is written."""
+        return NOTHING if value is None else format(self.scale * value, self.style)
+
+
+COLUMNS = (
+    Column("class_accuracy", "class", "%", ".1f", "high", "share of object-frames with the right class", 100),
+    Column("class_accuracy_last_half", "class, late", "%", ".1f", "high", "the same, second half of the run", 100),
+    Column("mssd_mm_median", "MSSD", "mm", ".1f", "low", "furthest surface point, best symmetry; median"),
+    Column("adds_mm_median", "ADD-S", "mm", ".1f", "low", "mean distance to the nearest surface point; median"),
+    Column("translation_mm_median", "position", "mm", ".1f", "low", "between the boxes' centres; median"),
+    Column("rotation_deg_median", "rotation", "°", ".1f", "low", "angle, up to symmetry; median"),
+    Column("missed_objects", "missed", "", "d", "low", "true objects without a match"),
+    Column("false_positive_objects", "false", "", "d", "low", "objects that match nothing true"),
+    Column("existing_objects_final", "at end", "", "d", "", "objects in the last map"),
+    Column("hypotheses_scored", "hypotheses", "", ",d", "", "poses rendered and scored against depth"),
+)
+OBJECT_COLUMNS = COLUMNS[:6]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell."""
+
+    text: str
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method, or one object by one method."""
+
+    name: str
+    cells: Sequence[Cell]
+    note: str = ""
+    """why there are no cells"""
+
+
+def known_columns(comparison: Comparison) -> list[Column]:
+    """Those of COLUMNS in which any method has a figure."""
+    metrics = [score.metrics for score in comparison.methods.values()]
+    return [column for column in COLUMNS if any(m.get(column.key) is not None for m in metrics)]
+
+
+def method_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: Sequence[Column]) -> list[Row]:
+    """One row a method: the columns, then seconds; the best of those with poses marked."""
+    done = [name for name, outcome in outcomes.items() if outcome.status == "ok"]
+    posed = [comparison.methods[name].metrics for name in done if outcomes[name].estimate is not None]
+    best = {column.key: _best(column, posed) for column in columns}
+    rows = []
+    for name, outcome in outcomes.items():
+        if outcome.status == "skipped":
+            rows.append(Row(name, (), f"skipped: {outcome.reason} {outcome.remedy}".strip()))
+            continue
+        metrics = comparison.methods[name].metrics
+        judged = outcome.estimate is not None and len(posed) > 1
+        cells = [
+            Cell((text := c.text(metrics.get(c.key))), judged and text != NOTHING and text == best[c.key])
+            for c in columns
+        ]
+        rows.append(Row(name, [*cells, Cell(NOTHING if outcome.seconds is None else f"{outcome.seconds:.1f}")]))
+    return rows
+
+
+def object_rows(comparison: Comparison, methods: Sequence[str]) -> list[tuple[str, list[Row]]]:
+    """For each true object, one row a method: OBJECT_COLUMNS."""
+    out = []
+    for label in comparison.labels:
+        metrics = {name: comparison.methods[name].metrics["objects"][label] for name in methods}
+        best = {c.key: _best(c, list(metrics.values())) for c in OBJECT_COLUMNS}
+        rows = [
+            Row(
+                name,
+                [
+                    Cell(t := c.text(m[c.key]), len(methods) > 1 and t not in (NOTHING,) and t == best[c.key])
+                    for c in OBJECT_COLUMNS
+                ],
+            )
+            for name, m in metrics.items()
+        ]
+        out.append((label, rows))
+    return out
+
+
+def _best(column: Column, metrics: Sequence[Mapping[str, Any]]) -> str | None:
+    """The best value as it is written, so that what looks equal is equally best; None where all are."""
+    values = [m[column.key] for m in metrics if m.get(column.key) is not None]
+    if not column.better or not values:
+        return None
+    written = {column.text(value) for value in values}
+    chosen = column.text(min(values) if column.better == "low" else max(values))
+    return chosen if len(written) > 1 else None
+
+
+AGREEMENT_COLUMNS = (
+    Column("class_agreement", "same class", "%", ".1f", "", "share of the reference's object-frames", 100),
+    Column("distance_mm_median", "apart", "mm", ".1f", "", "between the boxes' centres; median"),
+    Column("rotation_deg_median", "turned", "°", ".1f", "", "angle, up to symmetry; median"),
+    Column("objects_without_match", "lacks", "", "d", "", "objects of the reference that it doesn't have"),
+    Column("objects_only_here", "adds", "", "d", "", "objects that the reference doesn't have"),
+)
+
+
+def agreement_rows(comparison: Comparison) -> list[Row]:
+    """One row a method held to the reference: AGREEMENT_COLUMNS."""
+    rows = []
+    for name, agreement in comparison.agreement.items():
+        metrics = {k: v if np.isfinite(v) else None for k, v in agreement.metrics().items()}
+        rows.append(Row(name, [Cell(column.text(metrics[column.key])) for column in AGREEMENT_COLUMNS]))
+    return rows
+
+
+@dataclass(frozen=True)
+class Change:
+    """What hindsight changed about one object."""
+
+    name: str
+    final_class: int
+    before: str
+    """what the other method said, in words"""
+    moved: str
+    """how far its pose was off, in words"""
+    changed: bool
+    """whether there is anything to see"""
+
+
+def changes(comparison: Comparison, agreement: Agreement) -> list[Change]:
+    """One an object of the reference, those that changed most first."""
+    found = [_change(comparison, agreement, thing) for thing in agreement.objects]
+    return sorted(found, key=lambda change: not change.changed)
+
+
+def _change(comparison: Comparison, agreement: Agreement, thing: ObjectAgreement) -> Change:
+    name = f"{comparison.class_names[thing.final_class]} (object {thing.reference_object})".replace("_", " ")
+    if thing.other_object is None:
+        return Change(name, thing.final_class, f"{agreement.other} has no such object", NOTHING, True)
+    visible = thing.visible
+    differs = visible & (thing.reference_class != thing.other_class)
+    distance = thing.distance_m[visible & np.isfinite(thing.distance_m)]
+    moved = f"{1e3 * np.median(distance):.1f} mm, at most {1e3 * distance.max():.1f} mm" if len(distance) else NOTHING
+    far = len(distance) > 0 and distance.max() > MOVED_M
+    return Change(name, thing.final_class, _before(comparison, thing, differs), moved, bool(differs.any()) or far)
+
+
+def _before(comparison: Comparison, thing: ObjectAgreement, differs: np.ndarray) -> str:
+    if not differs.any():
+        return "the same class in every frame"
+    said, count = np.unique(thing.other_class[differs], return_counts=True)
+    words = [
+        f"{'not there' if obj_id < 0 else comparison.class_names[int(obj_id)].replace('_', ' ')} ({n})"
+        for obj_id, n in sorted(zip(said, count, strict=True), key=lambda pair: -pair[1])
+    ]
+    since = thing.first_agreement
+    end = "never settles" if since is None else f"settles at frame {since}"
+    return f"{differs.sum()} of {thing.visible.sum()} frames differ: {', '.join(words)}; {end}"
