@@ -1,8 +1,8 @@
 """Runs on disk: BOP datasets with a few files of ours beside (docs/run-layout.md).
 
-`load_run` reads all that an estimator may see and nothing of the truth; `load_truth` reads the truth; `RunWriter`
-writes both. Everything cheap is checked at once (all JSON, the header of each image); pixels are read, and judged, when
-a frame is asked for them.
+`load_run` reads all that an estimator may see and nothing of the truth; `load_truth` reads the truth; `RunWriter` of
+`sequences.writing` writes both. Everything cheap is checked at once (all JSON, the header of each image); pixels are
+read, and judged, when a frame is asked for them.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ from sequences.jsonfile import Node
 from sequences.problems import Checks
 from sequences.truth import load_truth
 from sequences.types import Frame, LocalisationNoise, Run, Visit
-from sequences.writing import FrameTruth, RunWriter, Sighting
 
-__all__ = ["FrameTruth", "RunWriter", "Sighting", "load_catalogue", "load_run", "load_truth"]
+__all__ = ["load_catalogue", "load_run", "load_truth"]
 
 Array = NDArray[np.float64]
 

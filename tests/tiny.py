@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from sequences import se3
-from sequences.bop import FrameTruth, RunWriter, Sighting
 from sequences.camera import Camera
 from sequences.catalogue import Catalogue, ContinuousSymmetry, Mesh, ObjectClass
 from sequences.types import Detection, LocalisationNoise
+from sequences.writing import FrameTruth, RunWriter, Sighting
 
 CAMERA = Camera(40.0, 41.0, 15.5, 11.5, width=32, height=24)
 NOISE = LocalisationNoise(rotation_rad=0.01, translation_m=0.02, correlation_time_s=5.0)

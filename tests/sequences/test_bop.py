@@ -14,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sequences import se3
-from sequences.bop import FrameTruth, RunWriter, Sighting, load_catalogue, load_run, load_truth
+from sequences.bop import load_catalogue, load_run, load_truth
 from sequences.camera import Camera
 from sequences.catalogue import Catalogue, ContinuousSymmetry, ObjectClass
 from sequences.errors import InputError
 from sequences.types import Detection, LocalisationNoise, Run
+from sequences.writing import FrameTruth, RunWriter, Sighting
 from tests.tiny import CAMERA, NOISE, SECOND, box_mesh, edit, make_plain, tiny_catalogue, write_tiny_run
 
 ROOT = Path(__file__).parents[2]
