@@ -1,0 +1,260 @@
+"""Colour images of a visit: a lamp under the ceiling with soft shadows, light from all around, and no OpenGL.
+
+Diffuse surfaces under Lambert's law, lit by an area lamp that is sampled at a few points, each with a shadow map
+(Williams, Casting curved shadows on curved surfaces, SIGGRAPH 1978), and by a hemisphere that is brighter above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from sequences import se3
+from sequences.camera import Camera
+from sequences.catalogue import Mesh
+from sequences.rendering.rasteriser import intrinsics
+from sequences.rendering.scene import SceneImages, render_scene
+
+Array = NDArray[np.float64]
+
+CREASE_RAD = 0.7  # faces that meet at a sharper edge are not shaded as one smooth surface
+LAMP_RADIUS_M = 0.35
+LAMP_SAMPLES = 12
+SHADOW_MAP = Camera(fx=300.0, fy=300.0, cx=359.5, cy=359.5, width=720, height=720)
+SHADOW_OFFSET_M = 0.006  # along the surface's normal, so that a surface doesn't shade itself
+AMBIENT, LAMP = 0.42, 0.95
+GAMMA = 1.0 / 2.2
+
+
+class Surface(NamedTuple):
+    """All faces of a scene, world frame."""
+
+    vertices: Array
+    """(V, 3)"""
+    faces: NDArray[np.int32]
+    """(F, 3)"""
+    offsets: NDArray[np.int64]
+    """(items + 1,) the first face of each item"""
+    colours: Array
+    """(V, 3) 0 to 255"""
+    normals: Array
+    """(3 F, 3) unit normal at each corner of each face, outwards"""
+
+
+class Lamp(NamedTuple):
+    """An area lamp."""
+
+    points: Array
+    """(L, 3) spread over it"""
+    shadow_maps: NDArray[np.float32]
+    """(L, h, w) depth below each point, looking straight down"""
+    lens: Array
+    """(4,) intrinsics of the shadow maps"""
+
+
+@dataclass(frozen=True)
+class LitScene:
+    """What stands still during a visit, ready to be drawn from anywhere."""
+
+    items: tuple[tuple[Mesh, Array], ...]
+    """meshes with T_world_object (4, 4)"""
+    surface: Surface
+    lamp: Lamp
+
+    def face_normals(self, images: SceneImages) -> Array:
+        """(h, w, 3) normal of the face that each pixel sees, outwards, world frame; zero where nothing is."""
+        face = self.surface.offsets[np.maximum(images.item, 0)] + np.maximum(images.face, 0)
+        normals = _unit(_area_vectors(self.surface.vertices[self.surface.faces]))
+        return np.where(images.item[..., None] >= 0, normals[face], 0.0)
+
+
+def light(items: Sequence[tuple[Mesh, Array]], lamp: Array) -> LitScene:
+    """Prepare a scene.
+
+    Args:
+        items: meshes with T_world_object (4, 4).
+        lamp: (3,) where the lamp hangs, metres, world frame.
+    """
+    vertices = [se3.transform(T, mesh.vertices) for mesh, T in items]
+    starts = np.cumsum([0] + [len(v) for v in vertices])
+    faces = [mesh.faces + np.int32(start) for (mesh, _), start in zip(items, starts, strict=False)]
+    normals = [corner_normals(mesh) @ T[:3, :3].T for mesh, T in items]
+    surface = Surface(
+        vertices=np.concatenate(vertices),
+        faces=np.concatenate(faces).astype(np.int32),
+        offsets=np.cumsum([0] + [len(f) for f in faces]),
+        colours=np.concatenate([mesh.colours for mesh, _ in items]).astype(np.float64),
+        normals=np.concatenate(normals),
+    )
+    points = lamp + _disc(LAMP_SAMPLES)
+    shadow_maps = np.stack([_shadow_map(items, point) for point in points])
+    return LitScene(tuple(items), surface, Lamp(points, shadow_maps, intrinsics(SHADOW_MAP)))
+
+
+def _disc(n: int) -> Array:
+    """(n, 3) points spread evenly over the lamp (Vogel's spiral)."""
+    k = np.arange(n)
+    angle, radius = k * np.pi * (3.0 - np.sqrt(5.0)), LAMP_RADIUS_M * np.sqrt((k + 0.5) / n)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(n)], axis=-1)
+
+
+def corner_normals(mesh: Mesh) -> Array:
+    """(3 F, 3) unit normals: at each corner the mean over the faces there that don't meet this one at a crease."""
+    weighted = _area_vectors(mesh.vertices[mesh.faces])
+    unit = _unit(weighted)
+    n = mesh.faces.size
+    incidence = csr_array((np.ones(n), mesh.faces.ravel(), np.arange(n + 1)), shape=(n, len(mesh.vertices)))
+    pairs = (incidence @ incidence.T).tocoo()  # corners that share a vertex
+    this, other = pairs.coords[0], pairs.coords[1] // 3
+    smooth = np.einsum("ij,ij->i", unit[this // 3], unit[other]) > np.cos(CREASE_RAD)
+    return _unit(
+        np.stack([np.bincount(this[smooth], weighted[other[smooth], d], minlength=n) for d in range(3)], axis=-1)
+    )
+
+
+def _area_vectors(corners: Array) -> Array:
+    """Triangles (F, 3, 3) -> (F, 3) their normals, twice their area long."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
+def _looking_down(point: Array) -> Array:
+    """T_world_lamp (4, 4)."""
+    return se3.make(np.diag([1.0, -1.0, -1.0]), point)
+
+
+def _shadow_map(items: Sequence[tuple[Mesh, Array]], point: Array) -> NDArray[np.float32]:
+    T_lamp_world = se3.inverse(_looking_down(point))
+    return render_scene([(mesh, T_lamp_world @ T) for mesh, T in items], SHADOW_MAP).depth
+
+
+def photograph(scene: LitScene, camera: Camera, T_world_camera: Array, antialias: int = 2) -> NDArray[np.uint8]:
+    """Colour image (h, w, 3) uint8 RGB.
+
+    Args:
+        scene: what there is.
+        camera: the image wanted.
+        T_world_camera: (4, 4).
+        antialias: each pixel is the mean of so many samples each way.
+    """
+    n, shift = antialias, (antialias - 1) / 2.0
+    fine = Camera(
+        camera.fx * n, camera.fy * n, camera.cx * n + shift, camera.cy * n + shift, camera.width * n, camera.height * n
+    )
+    T_camera_world = se3.inverse(T_world_camera)
+    images = render_scene([(mesh, T_camera_world @ T) for mesh, T in scene.items], fine)
+    out = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+    _shade(images, intrinsics(fine), T_world_camera, scene.surface, scene.lamp, n, out)
+    return out
+
+
+@numba.njit(inline="always")
+def _minus(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@numba.njit(inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(inline="always")
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@numba.njit(inline="always")
+def _row(table, k):
+    return table[k, 0], table[k, 1], table[k, 2]
+
+
+@numba.njit(inline="always")
+def _blend(weights, a, b, c):
+    la, lb, lc = weights
+    return la * a[0] + lb * b[0] + lc * c[0], la * a[1] + lb * b[1] + lc * c[1], la * a[2] + lb * b[2] + lc * c[2]
+
+
+@numba.njit(inline="always")
+def _barycentric(point, a, b, c):
+    """Weights of three corners at a point of their plane, by areas."""
+    along, across, offset = _minus(b, a), _minus(c, a), _minus(point, a)
+    plane = _cross(along, across)
+    square = max(_dot(plane, plane), 1e-30)
+    lb = min(max(_dot(_cross(offset, across), plane) / square, 0.0), 1.0)
+    lc = min(max(_dot(_cross(along, offset), plane) / square, 0.0), 1.0 - lb)
+    return 1.0 - lb - lc, lb, lc
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _lamp_light(point, normal, lamp):
+    """Light from the points of the lamp that `point` sees; 1 at two metres straight below them all."""
+    total = 0.0
+    lens, shadow_maps = lamp.lens, lamp.shadow_maps
+    off = (SHADOW_OFFSET_M * normal[0], SHADOW_OFFSET_M * normal[1], SHADOW_OFFSET_M * normal[2])
+    for k in range(lamp.points.shape[0]):
+        towards = _minus(_row(lamp.points, k), point)
+        square = _dot(towards, towards)
+        cosine = _dot(towards, normal) / np.sqrt(square)
+        if cosine <= 0.0:
+            continue
+        depth = towards[2] - off[2]
+        if depth > 0.1:
+            u = int(np.floor(lens[0] * (off[0] - towards[0]) / depth + lens[2] + 0.5))
+            v = int(np.floor(lens[1] * (towards[1] - off[1]) / depth + lens[3] + 0.5))
+            if 0 <= u < shadow_maps.shape[2] and 0 <= v < shadow_maps.shape[1]:
+                nearest = shadow_maps[k, v, u]
+                if 0.0 < nearest < depth - SHADOW_OFFSET_M:
+                    continue
+        total += 4.0 * cosine / square
+    return total / lamp.points.shape[0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _sample(u, v, z, f, lens, T, surface, lamp):
+    """Colour (r, g, b), 0 to 255, of face `f` at depth `z` in sample (u, v)."""
+    x, y = (u - lens[2]) / lens[0] * z, (v - lens[3]) / lens[1] * z
+    point = (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+    a, b, c = _row(surface.faces, f)
+    vertices, normals, colours = surface.vertices, surface.normals, surface.colours
+    weights = _barycentric(point, _row(vertices, a), _row(vertices, b), _row(vertices, c))
+    normal = _blend(weights, _row(normals, 3 * f), _row(normals, 3 * f + 1), _row(normals, 3 * f + 2))
+    length = np.sqrt(max(_dot(normal, normal), 1e-30))
+    normal = (normal[0] / length, normal[1] / length, normal[2] / length)
+    power = AMBIENT * (0.72 + 0.28 * normal[2]) + LAMP * _lamp_light(point, normal, lamp)
+    tone = power**GAMMA
+    base = _blend(weights, _row(colours, a), _row(colours, b), _row(colours, c))
+    return min(255.0, tone * base[0]), min(255.0, tone * base[1]), min(255.0, tone * base[2])
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
+def _shade(images, lens, T, surface, lamp, antialias, out):
+    depth, item, face = images
+    for row in numba.prange(out.shape[0]):
+        for column in range(out.shape[1]):
+            red, green, blue = 0.0, 0.0, 0.0
+            last, r, g, b = -1, 0.0, 0.0, 0.0
+            for v in range(row * antialias, (row + 1) * antialias):
+                for u in range(column * antialias, (column + 1) * antialias):
+                    if item[v, u] >= 0:
+                        f = surface.offsets[item[v, u]] + face[v, u]
+                        if f != last:  # within a pixel a face has one colour
+                            r, g, b = _sample(u, v, depth[v, u], f, lens, T, surface, lamp)
+                            last = f
+                        red, green, blue = red + r, green + g, blue + b
+            share = 1.0 / (antialias * antialias)
+            out[row, column, 0] = np.uint8(red * share + 0.5)
+            out[row, column, 1] = np.uint8(green * share + 0.5)
+            out[row, column, 2] = np.uint8(blue * share + 0.5)

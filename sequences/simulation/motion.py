@@ -1,0 +1,63 @@
+"""What happens between two visits: most things stay, some are taken somewhere else, the restless ones rather.
+
+How likely a thing is to have been moved after a time follows the persistence model of CT-Map (Zeng et al., IROS 2018,
+Equation 2, after Toris and Chernova, 2017): it stays with probability 1/2 + 1/2 exp(-dt / mu).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sequences.options import option
+from sequences.seeds import generator
+from sequences.simulation.place import Place, PlaceConfig, Placed, put, stock_place
+
+FIRST_VISIT_NS = 1_538_384_400_000_000_000  # 2018-10-01 09:00 UTC
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """The visits and what changes between them."""
+
+    visits: int = option(2, "recordings of the place", low=1, high=4)
+    gap_h: float = option(4.0, "hours from one visit to the next", low=0.05)
+    moves: int = option(1, "things taken to another surface between two visits", low=0)
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """One visit's truth."""
+
+    start_ns: int
+    """UTC"""
+    things: tuple[Placed, ...]
+    moved: tuple[int, ...]
+    """inst_ids of what was moved since the visit before"""
+
+
+def arrange(place: Place, place_config: PlaceConfig, config: MotionConfig, seed: int) -> tuple[Arrangement, ...]:
+    """Where everything is at each visit. Raises InputError where the place is too full."""
+    gap_ns = round(config.gap_h * 3600e9)
+    visits = [Arrangement(FIRST_VISIT_NS, stock_place(place, place_config, seed), ())]
+    for k in range(1, config.visits):
+        rng = generator(seed, "simulation.motion", keyframe=k)
+        before = visits[-1].things
+        movers = _choose_movers(before, config, rng)
+        things = {t.inst_id: t for t in before if t.inst_id not in movers}
+        for old in (t for t in before if t.inst_id in movers):
+            area = place.spots[old.spot].T_world_area
+            others = tuple(things.values())
+            things[old.inst_id] = put(place, old.inst_id, old.shape, others, place_config, rng, avoid_area=area)
+        visits.append(Arrangement(FIRST_VISIT_NS + k * gap_ns, tuple(things[t.inst_id] for t in before), movers))
+    return tuple(visits)
+
+
+def _choose_movers(things: tuple[Placed, ...], config: MotionConfig, rng: np.random.Generator) -> tuple[int, ...]:
+    """inst_ids of things, drawn without replacement by their probability of not having stayed."""
+    persistence = np.array([t.shape.object_class.persistence_s for t in things])
+    leave = 0.5 * (1.0 - np.exp(-config.gap_h * 3600.0 / persistence))
+    n = min(config.moves, len(things))
+    chosen = rng.choice(len(things), size=n, replace=False, p=leave / leave.sum())
+    return tuple(sorted(things[int(k)].inst_id for k in chosen))

@@ -1,0 +1,209 @@
+"""Closed triangle meshes from a few numbers: turned, rounded, swept, joined and painted.
+
+Every builder gives a watertight mesh whose faces are counter-clockwise seen from outside, in metres. Where two colours
+shall meet at a sharp line, the builders are told to put two rows of vertices there, so that no face blends them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sequences.catalogue import Mesh
+
+Array = NDArray[np.float64]
+Solid = tuple[Array, NDArray[np.int32]]
+"""vertices (V, 3), metres, and faces (F, 3)"""
+Paint = Callable[[Array], Array]
+"""vertices (V, 3) -> colours (V, 3), 0 to 255"""
+
+SEAM_M = 2e-4  # between the two rows of vertices where colours change
+
+
+def arc(centre: tuple[float, float], radius: float, start_deg: float, stop_deg: float, n: int = 5) -> list[list[float]]:
+    """Points of a circle's arc in the plane: a piece of a profile for `lathe`."""
+    angle = np.radians(np.linspace(start_deg, stop_deg, n))
+    return (np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).tolist()
+
+
+def seam(a: ArrayLike, b: ArrayLike, at: float) -> list[list[float]]:
+    """Two points on the line a-b around its height `at`, for a sharp change of colour in a profile (r, z)."""
+    start, run = np.asarray(a, dtype=np.float64), np.subtract(b, a)
+    heights = at + np.array([-0.5, 0.5]) * SEAM_M * np.sign(run[1])
+    return (start + (heights[:, None] - start[1]) / run[1] * run).tolist()
+
+
+def lathe(profile: Sequence[Sequence[float]], segments: int = 36) -> Solid:
+    """Turn a profile about z.
+
+    Args:
+        profile: (n, 2) radius and height, metres, both ends on the axis, running so that the solid lies to the left:
+            from the bottom's centre outwards and up, and for a hollow thing over the rim and down again inside.
+        segments: corners of each circle.
+    """
+    rings = np.asarray(profile, dtype=np.float64)[1:-1]
+    angle = 2.0 * np.pi * np.arange(segments) / segments
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    heights = np.broadcast_to(rings[:, None, 1:], (len(rings), segments, 1))
+    walls = np.concatenate([rings[:, None, :1] * circle, heights], axis=-1)
+    poles = [[0.0, 0.0, profile[0][1]], [0.0, 0.0, profile[-1][1]]]
+    return np.concatenate([walls.reshape(-1, 3), poles]), _tube_faces(len(rings), segments)
+
+
+def tube(path: ArrayLike, radius: ArrayLike, segments: int = 12, flatten: float = 1.0) -> Solid:
+    """A round bar along a path.
+
+    Args:
+        path: (n, 3) its middle line.
+        radius: (n,) or one number for the whole path.
+        segments: corners of each cross-section.
+        flatten: its thickness across the plane in which the path bends, as a share of that in the plane. A straight
+            path bends in a level plane, or in the plane x = 0 where it runs along z.
+    """
+    line = np.asarray(path, dtype=np.float64)
+    along = np.gradient(line, axis=0)
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    across = np.cross(line[-1] - line[0], line[len(line) // 2] - line[0])
+    if np.linalg.norm(across) < 1e-12:
+        upwards = np.roll([0.0, 0.0, 1.0], int(abs(along[0, 2]) > 0.9))
+        across = upwards - (upwards @ along[0]) * along[0]
+    across /= np.linalg.norm(across)
+    inward = np.cross(across, along)
+    angle = 2.0 * np.pi * np.arange(segments) / segments
+    size = np.broadcast_to(np.asarray(radius, dtype=np.float64), len(line))[:, None, None]
+    offsets = np.cos(angle)[:, None] * inward[:, None] + flatten * np.sin(angle)[:, None] * across
+    walls = line[:, None] + size * offsets
+    faces = _tube_faces(len(line), segments)
+    return oriented((np.concatenate([walls.reshape(-1, 3), line[:1], line[-1:]]), faces))
+
+
+def _tube_faces(rings: int, segments: int) -> NDArray[np.int32]:
+    """Faces between rings of vertices, and fans to the two poles that follow them."""
+    ring, k = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
+    a, b = (ring * segments + k).ravel(), (ring * segments + (k + 1) % segments).ravel()
+    c, d = a + segments, b + segments
+    rim, following = np.arange(segments), (np.arange(segments) + 1) % segments
+    top, pole = (rings - 1) * segments, np.full(segments, rings * segments)
+    parts = [(a, b, d), (a, d, c), (following, rim, pole), (top + rim, top + following, pole + 1)]
+    return np.concatenate([np.stack(part, axis=-1) for part in parts]).astype(np.int32)
+
+
+def rounded_box(
+    size: ArrayLike,
+    radius: float,
+    cuts: tuple[Sequence[float], Sequence[float], Sequence[float]] = ((), (), ()),
+    steps: int = 2,
+) -> Solid:
+    """A box about the origin with rounded edges and corners.
+
+    Args:
+        size: (3,) outer measures, metres.
+        radius: of edges and corners, less than half the least measure.
+        cuts: coordinates along x, y and z at which colours may change sharply.
+        steps: faces along each rounded edge's quarter circle, half of them on either side.
+    """
+    half = np.asarray(size, dtype=np.float64) / 2.0
+    lines = [_grid_lines(h, radius, cut, steps) for h, cut in zip(half, cuts, strict=True)]
+    vertices, faces = _box_grid(lines)
+    core = np.clip(vertices, -(half - radius), half - radius)
+    out = vertices - core
+    length = np.linalg.norm(out, axis=-1, keepdims=True)
+    return core + radius * out / np.maximum(length, 1e-12), faces
+
+
+def _grid_lines(half: float, radius: float, cuts: Sequence[float], steps: int) -> Array:
+    """Coordinates of a box's grid lines along one axis. On the edge they are tangents, so that arcs are cut evenly."""
+    edge = half - radius + radius * np.tan(np.linspace(0.0, np.pi / 4.0, steps // 2 + 1))
+    seams = [c + d for c in cuts for d in (-0.5 * SEAM_M, 0.5 * SEAM_M) if abs(c) < half - radius]
+    return np.unique(np.round(np.concatenate([edge, -edge, seams]), 9))
+
+
+def cuts_every(step: float, half: float) -> tuple[float, ...]:
+    """Cuts at most `step` apart over -half..half, symmetric about 0."""
+    n = max(1, int(np.ceil(2.0 * half / step)))
+    return tuple(np.linspace(-half, half, n + 1)[1:-1].tolist())
+
+
+def _box_grid(lines: Sequence[Array]) -> Solid:
+    """The surface of a box whose faces are cut along the given coordinates."""
+    vertices, faces, start = [], [], 0
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        p, q = np.meshgrid(lines[first], lines[second], indexing="ij")
+        index = np.arange(p.size).reshape(p.shape)
+        a, b, c, d = (index[i, j].ravel() for i, j in _CORNERS)
+        for side in (0, -1):
+            points = np.empty((p.size, 3))
+            points[:, first], points[:, second], points[:, axis] = p.ravel(), q.ravel(), lines[axis][side]
+            quads = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+            faces.append(start + (quads if side == -1 else quads[:, ::-1]))
+            vertices.append(points)
+            start += p.size
+    stacked: Array = np.round(np.concatenate(vertices), 9)
+    unique, inverse = np.unique(stacked, axis=0, return_inverse=True)
+    return unique, inverse.reshape(-1)[np.concatenate(faces)].astype(np.int32)
+
+
+_CORNERS = (
+    (slice(None, -1), slice(None, -1)),
+    (slice(1, None), slice(None, -1)),
+    (slice(1, None), slice(1, None)),
+    (slice(None, -1), slice(1, None)),
+)
+
+
+def moved(solid: Solid, offset: ArrayLike, R: Array | None = None) -> Solid:
+    """Turn a solid by R (3, 3), then shift it, metres."""
+    vertices: Array = solid[0] if R is None else solid[0] @ R.T
+    return vertices + np.asarray(offset, dtype=np.float64), solid[1]
+
+
+def scaled(solid: Solid, factors: ArrayLike) -> Solid:
+    """Stretch a solid along the axes."""
+    vertices: Array = solid[0] * np.asarray(factors)
+    return vertices, solid[1]
+
+
+def oriented(solid: Solid) -> Solid:
+    """The solid with its faces turned outwards, should they look inwards (the sign of its volume says so)."""
+    corners = solid[0][solid[1]]
+    volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return solid if volume > 0 else (solid[0], np.ascontiguousarray(solid[1][:, ::-1]))
+
+
+def rotation(axis: str, degrees: float) -> Array:
+    """(3, 3) rotation about x, y or z."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    R = np.eye(3)
+    R[i, i], R[j, j], R[i, j], R[j, i] = c, c, -s, s
+    return R
+
+
+def plain(colour: ArrayLike) -> Paint:
+    """One colour all over."""
+    return lambda vertices: np.broadcast_to(np.asarray(colour, dtype=np.float64), vertices.shape)
+
+
+def bands(axis: int, limits: Sequence[float], colours: Sequence[Sequence[float]]) -> Paint:
+    """Colours by the coordinate along an axis; one more colour than limits."""
+    table = np.asarray(colours, dtype=np.float64)
+    return lambda vertices: table[np.searchsorted(np.asarray(limits), vertices[:, axis])]
+
+
+def join(parts: Sequence[tuple[Solid, Paint]]) -> Mesh:
+    """Paint solids and join them where they are."""
+    vertices = np.concatenate([solid[0] for solid, _ in parts])
+    colours = np.concatenate([np.asarray(paint(solid[0]), dtype=np.float64) for solid, paint in parts])
+    starts = np.cumsum([0] + [len(solid[0]) for solid, _ in parts])
+    faces = np.concatenate([solid[1] + start for (solid, _), start in zip(parts, starts, strict=False)])
+    return Mesh(vertices, faces.astype(np.int32), np.clip(np.round(colours), 0, 255).astype(np.uint8))
+
+
+def assemble(parts: Sequence[tuple[Solid, Paint]]) -> Mesh:
+    """As `join`, with the origin moved to the centre of the bounding box."""
+    mesh = join(parts)
+    centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
+    return Mesh(mesh.vertices - centre, mesh.faces, mesh.colours)
