@@ -7,6 +7,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 Array = NDArray[np.float64]
 
@@ -21,6 +23,22 @@ class Mesh:
     """(F, 3) vertex indices"""
     colours: NDArray[np.uint8]
     """(V, 3) RGB; mid-grey where the file has none"""
+
+    @cached_property
+    def is_solid(self) -> bool:
+        """Whether the faces enclose volumes and face outwards: seen from outside, a face from behind is hidden."""
+        places, welded = np.unique(self.vertices, axis=0, return_inverse=True)
+        faces = welded.reshape(-1)[self.faces].astype(np.int64)
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        forth, back = start * len(places) + end, end * len(places) + start
+        if len(faces) == 0 or not np.array_equal(np.sort(forth), np.sort(back)):
+            return False
+        # each of the bodies has its own sign of volume
+        body = connected_components(coo_array((np.ones(len(start)), (start, end)), shape=(len(places),) * 2))[1]
+        a, b, c = np.swapaxes(places[faces], 0, 1)
+        volumes = np.bincount(body[faces[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=body.max() + 1)
+        return bool((volumes[np.unique(body[faces[:, 0]])] > 0.0).all())
 
 
 @dataclass(frozen=True)

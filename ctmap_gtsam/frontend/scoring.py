@@ -16,7 +16,8 @@ from factors.measurement import pixel_log_ratio
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.geometry import Plane, plane_depth
-from sequences.rendering.rasteriser import intrinsics, project, rasterise
+from sequences.rendering.kernels import project, rasterise
+from sequences.rendering.rasteriser import coordinates, intrinsics
 
 Array = NDArray[np.float64]
 
@@ -74,14 +75,13 @@ class Scores:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _score(vertices, faces, poses, camera, depth, background, parameters, margin, out):
+def _score(vertices, faces, solid, poses, camera, depth, background, parameters, margin, out):
     height, width = depth.shape
-    no_ids = np.empty((0, 0), np.int32)
     for k in numba.prange(poses.shape[0]):
-        projected = np.empty((vertices.shape[0], 3))
+        projected = np.empty(vertices.shape)
         inverse_depth = np.zeros((height, width))
-        project(vertices, poses[k], camera[0], camera[1], camera[2], camera[3], projected)
-        rasterise(projected, faces, inverse_depth, no_ids)
+        project(vertices, poses[k], camera, projected)
+        rasterise(projected, faces, solid, inverse_depth, None)
         total = 0.0
         covered, visible = 0, 0
         u0, v0, u1, v1 = width, height, -1, -1
@@ -117,7 +117,18 @@ def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Arra
     poses = np.ascontiguousarray(T_camera_object, dtype=np.float64)
     out = np.empty((len(poses), 7))
     camera = intrinsics(tile.camera)
-    _score(mesh.vertices, mesh.faces, poses, camera, tile.depth, tile.background, parameters, margin_m, out)
+    _score(
+        coordinates(mesh),
+        mesh.faces,
+        mesh.is_solid,
+        poses,
+        camera,
+        tile.depth,
+        tile.background,
+        parameters,
+        margin_m,
+        out,
+    )
     # samples stand for step x step pixels
     half = tile.step / 2.0
     box = out[:, 3:] * tile.step + np.array([tile.x, tile.y, tile.x, tile.y]) + np.array([-half, -half, half, half])
@@ -126,10 +137,10 @@ def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Arra
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(projected, faces, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
+def _normal_equations(projected, faces, solid, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
     """Point-to-plane normal equations of one pose in its own right tangent; returns the sum of weights."""
     inverse_depth[:] = 0.0
-    rasterise(projected, faces, inverse_depth, ids)
+    rasterise(projected, faces, solid, inverse_depth, ids)
     H[:] = 0.0
     g[:] = 0.0
     total = 0.0
@@ -187,17 +198,17 @@ def _move(T, xi):
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _refine(vertices, faces, normals, poses, camera, depth, widths, hessians):
+def _refine(vertices, faces, solid, normals, poses, camera, depth, widths, hessians):
     for k in numba.prange(poses.shape[0]):
-        projected = np.empty((vertices.shape[0], 3))
+        projected = np.empty(vertices.shape)
         inverse_depth = np.empty(depth.shape)
         ids = np.zeros(depth.shape, np.int32)
         H, g = np.empty((6, 6)), np.empty(6)
         T = poses[k].copy()
         for step in range(widths.shape[0]):
-            project(vertices, T, camera[0], camera[1], camera[2], camera[3], projected)
+            project(vertices, T, camera, projected)
             total = _normal_equations(
-                projected, faces, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
+                projected, faces, solid, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
             )
             hessians[k] = H
             if total < 6.0:
@@ -238,6 +249,5 @@ def refine_on_depth(
     camera = intrinsics(tile.camera)
     hessians = np.zeros((len(poses), 6, 6))
     widths = np.asarray(widths_m, dtype=np.float64)
-    _refine(mesh.vertices, mesh.faces, normals, poses, camera, tile.depth, widths, hessians)
+    _refine(coordinates(mesh), mesh.faces, mesh.is_solid, normals, poses, camera, tile.depth, widths, hessians)
     return poses, hessians
-

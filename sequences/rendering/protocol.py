@@ -24,7 +24,7 @@ class DepthRenderer(Protocol):
         """Depth images (K, height, width), metres along z, 0 where nothing is.
 
         Args:
-            mesh: faces are seen from both sides. What is nearer than `rasteriser.NEAR_M` is undefined.
+            mesh: faces are seen from both sides. What is nearer than `kernels.NEAR_M` is undefined.
             camera: pixel centres at whole numbers; part of an image, with a stride, is `Camera.window`.
             T_camera_object: (K, 4, 4), metres.
 

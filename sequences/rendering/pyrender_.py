@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
+from sequences.rendering.kernels import NEAR_M
 from sequences.rendering.protocol import Unavailable
-from sequences.rendering.rasteriser import NEAR_M
 
 SYSTEM_PACKAGES = ("libegl1", "libgl1")
 """Debian and Ubuntu packages that it needs (software rendering comes with libegl1, as libgl1-mesa-dri)"""

@@ -1,7 +1,7 @@
 """Images of many things at once: depth, which thing, which face, and a colour image of them. No OpenGL.
 
 The simulator, the report and the notebooks draw with these; the estimators score with the tile kernels of
-`sequences.rendering.rasteriser`, whose sampling they share: pixels at their centres, 1/z linear within a triangle.
+`sequences.rendering.kernels`, whose sampling they share: pixels at their centres, 1/z linear within a triangle.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from sequences import se3
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
-from sequences.rendering.rasteriser import NEAR_M, intrinsics, rasterise
+from sequences.rendering.kernels import NEAR_M, rasterise
+from sequences.rendering.rasteriser import intrinsics
 
 Array = NDArray[np.float64]
 Items = Sequence[tuple[Mesh, Array]]
@@ -40,14 +41,14 @@ def render_scene(items: Items, camera: Camera) -> SceneImages:
 
     Args:
         items: pairs of mesh and T_camera_object (4, 4), metres. Faces are seen from both sides; what reaches behind the
-            near plane (`rasteriser.NEAR_M`) is cut there.
+            near plane (`kernels.NEAR_M`) is cut there.
         camera: the image; a window of it (`Camera.window`) does as well.
     """
     vertices, faces, offsets = _in_camera(items)
     projected, drawn, origin = _clip_and_project(vertices, faces, intrinsics(camera))
     inverse_depth = np.zeros((camera.height, camera.width))
     ids = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    rasterise(projected, drawn, inverse_depth, ids)
+    rasterise(projected, drawn, False, inverse_depth, ids)
     return _unpack(inverse_depth, ids, origin, offsets)
 
 
@@ -96,7 +97,7 @@ def _clip_and_project(vertices, faces, intrinsics):
         intrinsics: (4,) fx, fy, cx, cy.
 
     Returns:
-        Projected vertices (V', 3) u, v, 1/z, faces (F', 3) of them, and the face (F',) each is a part of.
+        Projected vertices (3, V') u, v, 1/z, faces (F', 3) of them, and the face (F',) each is a part of.
     """
     n = faces.shape[0]
     crossing = 0
@@ -130,10 +131,16 @@ def _clip_and_project(vertices, faces, intrinsics):
             origin[count] = f
             count += 1
     fx, fy, cx, cy = intrinsics
+    projected = np.zeros((3, used))
     for i in range(used):
-        w = 1.0 / points[i, 2] if points[i, 2] > 0.0 else 0.0
-        points[i, 0], points[i, 1], points[i, 2] = fx * points[i, 0] * w + cx, fy * points[i, 1] * w + cy, w
-    return points[:used], drawn[:count], origin[:count]
+        if points[i, 2] > 0.0:
+            w = 1.0 / points[i, 2]
+            projected[0, i], projected[1, i], projected[2, i] = (
+                fx * points[i, 0] * w + cx,
+                fy * points[i, 1] * w + cy,
+                w,
+            )
+    return projected, drawn[:count], origin[:count]
 
 
 @numba.njit(cache=True, nogil=True)
