@@ -10,6 +10,7 @@ done <<END
 libEGL.so.1 libegl1
 libGL.so.1 libgl1
 libX11.so.6 libx11-6
+libXrender.so.1 libxrender1
 libusb-1.0.so.0 libusb-1.0-0
 libudev.so.1 libudev1
 libidn2.so.0 libidn2-0
