@@ -198,23 +198,18 @@ class Estimate:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
             meta = json.loads(str(arrays.pop("meta")))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            if meta.get("schema") == SCHEMA:
+                return _unpack(arrays, meta)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"not an estimate ({error})", file=path, remedy="delete it and run the method again"
             ) from error
-        if meta.get("schema") != SCHEMA:
-            raise InputError(
-                f"estimate of schema {meta.get('schema')}, this version reads {SCHEMA}",
-                file=path,
-                field="meta.schema",
-                remedy="delete it and run the method again",
-            )
-        tables = {"modes": Modes, "moves": Moves, "ledger": Ledger}
-        parts = {
-            name: kind(**{f.name: arrays.pop(f"{name}.{f.name}") for f in fields(kind)})
-            for name, kind in tables.items()
-        }
-        return cls(**arrays, **parts, meta=meta)  # type: ignore[arg-type]
+        raise InputError(
+            f"estimate of schema {meta.get('schema')}, this version reads {SCHEMA}",
+            file=path,
+            field="meta.schema",
+            remedy="delete it and run the method again",
+        )
 
 
 @dataclass(frozen=True)
@@ -232,6 +227,15 @@ class Snapshot:
     """(n, 4, 4)"""
     T_world_camera: Array
     """(4, 4)"""
+
+
+def _unpack(arrays: dict[str, Any], meta: dict[str, Any]) -> Estimate:
+    """Raises KeyError, TypeError or ValueError where an array is missing, unknown or of another shape."""
+    parts = {
+        name: kind(**{f.name: arrays.pop(f"{name}.{f.name}") for f in fields(kind)})
+        for name, kind in {"modes": Modes, "moves": Moves, "ledger": Ledger}.items()
+    }
+    return Estimate(**arrays, **parts, meta=meta)  # type: ignore[arg-type]
 
 
 def _pack(estimate: Estimate) -> bytes:

@@ -77,21 +77,15 @@ def known_columns(comparison: Comparison) -> list[Column]:
 
 def method_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: Sequence[Column]) -> list[Row]:
     """One row a method: the columns, then seconds; the best of those with poses marked."""
-    done = [name for name, outcome in outcomes.items() if outcome.status == "ok"]
-    posed = [comparison.methods[name].metrics for name in done if outcomes[name].estimate is not None]
-    best = {column.key: _best(column, posed) for column in columns}
+    posed = [comparison.methods[name].metrics for name, outcome in outcomes.items() if outcome.estimate is not None]
     rows = []
     for name, outcome in outcomes.items():
         if outcome.status == "skipped":
             rows.append(Row(name, (), f"skipped: {outcome.reason} {outcome.remedy}".strip()))
             continue
-        metrics = comparison.methods[name].metrics
-        judged = outcome.estimate is not None and len(posed) > 1
-        cells = [
-            Cell((text := c.text(metrics.get(c.key))), judged and text != NOTHING and text == best[c.key])
-            for c in columns
-        ]
-        rows.append(Row(name, [*cells, Cell(NOTHING if outcome.seconds is None else f"{outcome.seconds:.1f}")]))
+        rivals = posed if outcome.estimate is not None else []
+        seconds = Cell(NOTHING if outcome.seconds is None else f"{outcome.seconds:.1f}")
+        rows.append(Row(name, [*_cells(columns, comparison.methods[name].metrics, rivals), seconds]))
     return rows
 
 
@@ -100,19 +94,13 @@ def object_rows(comparison: Comparison, methods: Sequence[str]) -> list[tuple[st
     out = []
     for label in comparison.labels:
         metrics = {name: comparison.methods[name].metrics["objects"][label] for name in methods}
-        best = {c.key: _best(c, list(metrics.values())) for c in OBJECT_COLUMNS}
-        rows = [
-            Row(
-                name,
-                [
-                    Cell(t := c.text(m[c.key]), len(methods) > 1 and t not in (NOTHING,) and t == best[c.key])
-                    for c in OBJECT_COLUMNS
-                ],
-            )
-            for name, m in metrics.items()
-        ]
-        out.append((label, rows))
+        rivals = list(metrics.values())
+        out.append((label, [Row(name, _cells(OBJECT_COLUMNS, one, rivals)) for name, one in metrics.items()]))
     return out
+
+
+def _cells(columns: Sequence[Column], metrics: Mapping[str, Any], rivals: Sequence[Mapping[str, Any]]) -> list[Cell]:
+    return [Cell(text := c.text(metrics.get(c.key)), text == _best(c, rivals)) for c in columns]
 
 
 def _best(column: Column, metrics: Sequence[Mapping[str, Any]]) -> str | None:

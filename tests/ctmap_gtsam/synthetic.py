@@ -1,14 +1,20 @@
-"""Estimates made from the truth, right or wrong by known amounts, for the tests of metrics, exports and reports."""
+"""A small run, and estimates made from its truth, right or wrong by known amounts, to test all that is reported."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from ctmap_gtsam.estimate import Estimate, Ledger, Modes, Moves
+from ctmap_gtsam.evaluation.silhouettes import silhouettes
 from sequences import se3
-from sequences.types import Run, Truth
+from sequences.camera import Camera
+from sequences.catalogue import Catalogue, Mesh, ObjectClass
+from sequences.rendering.scene import render_scene, shade
+from sequences.types import Detection, Run, Truth
+from sequences.writing import FrameTruth, RunWriter, Sighting, VisitWriter
 
 RIGHT = 0.9
 """P(class) of the class that an estimate made here says"""
@@ -108,4 +114,77 @@ def unplaced(estimate: Estimate, rows: Sequence[int]) -> Estimate:
             "in_view": estimate.in_view[keep],
             "modes": Modes(**{**vars(modes), "object": new_row[modes.object]}),
         }
+    )
+
+
+def solid(size: Sequence[float]) -> Mesh:
+    """A box about the origin."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+    return Mesh(corners * np.asarray(size), faces, np.full((8, 3), 150, dtype=np.uint8))
+
+
+def catalogue() -> Catalogue:
+    """A carton without symmetry, a brick with half-turns about z, a crate like the carton."""
+    half = se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    parts = (
+        (3, "carton", (0.08, 0.06, 0.12), np.eye(4)[None]),
+        (5, "clay_brick", (0.10, 0.05, 0.06), np.stack([np.eye(4), half])),
+        (9, "crate", (0.09, 0.07, 0.11), np.eye(4)[None]),
+    )
+    return Catalogue(
+        tuple(
+            ObjectClass(obj_id, name, "box", 3600.0, False, True, solid(s), float(np.linalg.norm(s)), symmetries, ())
+            for obj_id, name, s, symmetries in parts
+        )
+    )
+
+
+OBJECTS = (  # inst_id, obj_id, position in the world, metres
+    (1, 3, (-0.15, 0.0, 0.06)),
+    (2, 5, (0.0, 0.03, 0.03)),
+    (3, 3, (0.16, -0.02, 0.06)),
+)
+CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
+
+
+def write_run(path: Path, frames: int = 8, visits: int = 1) -> Path:
+    """Two cartons and a brick with their truth, seen by a moving camera; the detector takes carton 1 for a crate."""
+    classes = catalogue()
+    R = np.array([[1.0, 0.0, 0.0], [0.0, -0.6, -0.8], [0.0, 0.8, -0.6]]).T
+    with RunWriter(path, classes, source="tests", up_world=np.array([0.0, 0.0, 1.0])) as writer:
+        for v in range(visits):
+            visit = writer.add_visit(v + 1)
+            for f in range(frames):
+                T_world_camera = se3.make(R, np.array([0.01 * (f - 4), -0.56, 0.48]))
+                _write_frame(visit, classes, f, 10**9 * 3600 * v + f * 10**8, T_world_camera)
+    return path
+
+
+def _write_frame(visit: VisitWriter, classes: Catalogue, f: int, time_ns: int, T_world_camera: np.ndarray) -> None:
+    placed = [
+        (inst, obj_id, se3.make(se3.so3_exp(np.array([0, 0, 0.3 * inst])), np.array(t))) for inst, obj_id, t in OBJECTS
+    ]
+    T_camera_world = se3.inverse(T_world_camera)
+    items = [(classes[obj_id].mesh, T_camera_world @ T) for _, obj_id, T in placed]
+    images = render_scene(items, CAMERA)
+    drawn = silhouettes(classes, [o for _, o, _ in placed], np.stack([T for _, T in items]), CAMERA)
+    detections = []
+    for (inst, obj_id, _), seen in zip(placed, drawn, strict=True):
+        scores = np.full(1 + len(classes), 0.1)
+        scores[1 + classes.index(9 if inst == 1 else obj_id)] = 0.7
+        detections.append(Detection(seen.visible_box, scores))
+    visit.add_frame(
+        im_id=f,
+        time_ns=time_ns,
+        camera=CAMERA,
+        T_world_camera=T_world_camera,
+        depth=images.depth,
+        colour=shade(items, CAMERA, images, background=(120, 110, 100)),
+        detections=detections,
+        truth=FrameTruth(
+            T_world_camera,
+            tuple(Sighting(i, o, T, s.visible_fraction) for (i, o, T), s in zip(placed, drawn, strict=True)),
+        ),
     )
