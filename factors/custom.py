@@ -113,9 +113,12 @@ def _checked(name: str, array: Any, shape: tuple[int, ...], key: int | None) -> 
     """The array as GTSAM takes it. `key` is None for the residual."""
     what = "residual" if key is None else f"Jacobian of {gtsam.DefaultKeyFormatter(key)}"
     try:
-        out = np.asarray(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FactorValueError(name, what, f"isn't an array of real numbers: {error}") from error
+        raw = np.asarray(array)
+    except ValueError as error:
+        raise FactorValueError(name, what, f"isn't an array: {error}") from error
+    if raw.dtype.kind not in "fiu":
+        raise FactorValueError(name, what, f"isn't made of real numbers but of {raw.dtype}")
+    out = raw.astype(np.float64, copy=False)
     if out.shape != shape:
         raise FactorShapeError(name, what, shape, out.shape)
     if not np.isfinite(out).all():

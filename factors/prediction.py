@@ -101,7 +101,9 @@ def integrated_log_potential(
     """
     r, J_a, J_b = reduced_residual_jacobians(T_a, T_b, symmetry, np.linalg.inv(np.asarray(sigma, np.float64)))
     total = symmetry.reduced_covariance(sigma)
-    for J, spread in ((J_a, covariance_a), (J_b, covariance_b)):
+    # turning an object about its free axis only turns the residual with it, which no isotropic Sigma notices
+    meant = np.eye(6) - symmetry.generators @ symmetry.reader
+    for J, spread in ((J_a @ meant, covariance_a), (J_b @ meant, covariance_b)):
         total = total + J @ np.asarray(spread, dtype=np.float64) @ np.swapaxes(J, -1, -2)
     return mixture.gaussian_log_density(r, np.linalg.inv(total))
 
