@@ -18,6 +18,7 @@ from ctmap_gtsam.parameters import (
 )
 from ctmap_gtsam.runtime import settings
 from sequences.options import option
+from sequences.simulation import SimulationConfig
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Config:
     frontend: Frontend = field(default_factory=Frontend)
     filter: Filter = field(default_factory=Filter)
     smoother: Smoother = field(default_factory=Smoother)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
 
     def __post_init__(self) -> None:
         settings.check(self)
