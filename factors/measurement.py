@@ -80,7 +80,7 @@ class DepthModel:
     """how well a known background's depth is known beyond the sensor's own noise, metres"""
 
     def parameters(self) -> DepthParameters:
-        """The constants that `pixel_log_ratio` takes: a, b, w, 1/range, occluder weight, background variance."""
+        """The constants that `pixel_ratio` takes: a, b, w, 1/range, occluder weight, background variance."""
         background_variance = self.background_sigma_m**2
         return (
             float(self.sigma_m),
@@ -118,53 +118,83 @@ def _below(x, bell):
 
 
 @numba.njit(**_KERNEL)
-def pixel_log_ratio(z, rendered, background, parameters):
-    """One pixel's log [p(z | object) / p(z | no object)] in nats: the one implementation, for other kernels to call.
+def pixel_without_object(z, background, parameters):
+    """What a pixel says without the object: the part of `pixel_ratio` that all hypotheses of an image share.
 
     Args:
-        z: measured depth, metres; 0 or NaN = no measurement, which gives 0.
-        rendered: the object's depth there, metres; 0, NaN or inf = not covered, which gives 0.
+        z: measured depth, metres; 0 or NaN = no measurement.
         background: depth of what would be seen without the object, metres; 0, NaN or inf = unknown.
         parameters: `DepthModel.parameters()`.
+
+    Returns:
+        p_b(z), 1/m; 1 / p(z | no object), metres, 0 without a measurement; the background's depth, metres, and its
+        variance, both 0 where it is unknown.
     """
-    if not (z > 0.0 and 0.0 < rendered < math.inf):
-        return 0.0
     sigma_floor, sigma_quadratic, outlier, inverse_range, occluder, background_variance = parameters
-    sigma = sigma_floor + sigma_quadratic * rendered * rendered
-    inverse_sigma = 1.0 / sigma
-    x = (z - rendered) * inverse_sigma
-    if x < -_CUT:  # an occluder: both hypotheses say the same of it
-        return 0.0
+    if not z > 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    clean, variance = inverse_range, 0.0
     if 0.0 < background < math.inf:
         tau = sigma_floor + sigma_quadratic * background * background
         variance = background_variance + tau * tau
         inverse_tau = 1.0 / math.sqrt(variance)
-        inverse_background = 1.0 / background
         clean = (1.0 - occluder) * _INV_SQRT_2PI * inverse_tau * _bell((z - background) * inverse_tau)
         if z < background:
-            clean += occluder * inverse_background
-        gap = (rendered - background) / math.sqrt(variance + sigma * sigma)
-        hidden = (1.0 - occluder) * _below(gap, _bell(gap)) + occluder * min(1.0, rendered * inverse_background)
+            clean += occluder / background
     else:
-        clean = inverse_range
-        hidden = min(1.0, rendered * inverse_range)
+        background = 0.0
+    return clean, 1.0 / ((1.0 - outlier) * clean + outlier * inverse_range), background, variance
+
+
+@numba.njit(**_KERNEL)
+def pixel_ratio(z, rendered, without, parameters):
+    """One pixel's p(z | object) / p(z | no object): the one implementation, for other kernels to multiply.
+
+    Args:
+        z: measured depth, metres; 0 or NaN = no measurement, which gives 1.
+        rendered: the object's depth there, metres; 0, NaN or inf = not covered, which gives 1.
+        without: of `pixel_without_object` for this pixel.
+        parameters: `DepthModel.parameters()`.
+    """
+    if not (z > 0.0 and 0.0 < rendered < math.inf):
+        return 1.0
+    sigma_floor, sigma_quadratic, outlier, inverse_range, occluder, _ = parameters
+    clean, inverse_without, background, variance = without
+    sigma = sigma_floor + sigma_quadratic * rendered * rendered
     floor = outlier * inverse_range
-    keep = 1.0 - outlier
+    if z < rendered - _CUT * sigma:  # an occluder: both hypotheses say the same of it
+        return 1.0
+    if z > rendered + _CUT * sigma:  # seen past: only an outlier explains it
+        return floor * inverse_without
+    if background > 0.0:
+        gap, spread = rendered - background, variance + sigma * sigma
+        if gap * gap > _CUT * _CUT * spread:  # most pixels: the surfaces are well apart
+            below = 1.0 if gap > 0.0 else 0.0
+        else:
+            gap /= math.sqrt(spread)
+            below = _below(gap, _bell(gap))
+        hidden = (1.0 - occluder) * below + occluder * min(1.0, rendered / background)
+    else:
+        hidden = min(1.0, rendered * inverse_range)
+    inverse_sigma = 1.0 / sigma
+    x = (z - rendered) * inverse_sigma
     bell = _bell(x)
+    keep = 1.0 - outlier
     with_object = keep * (clean * _below(-x, bell) + (1.0 - hidden) * _INV_SQRT_2PI * inverse_sigma * bell) + floor
-    return math.log(with_object / (keep * clean + floor))
+    return with_object * inverse_without
 
 
 @numba.njit(**_KERNEL)
 def _log_ratios(z, rendered, background, parameters, out):
     for i in range(z.shape[0]):
-        out[i] = pixel_log_ratio(z[i], rendered[i], background[i], parameters)
+        without = pixel_without_object(z[i], background[i], parameters)
+        out[i] = math.log(pixel_ratio(z[i], rendered[i], without, parameters))
 
 
 def depth_log_ratio(
     z: ArrayLike, rendered: ArrayLike, background: ArrayLike = 0.0, model: DepthModel | None = None
 ) -> Array:
-    """`pixel_log_ratio` over arrays that broadcast together.
+    """log of `pixel_ratio` over arrays that broadcast together.
 
     Args:
         z: (...) measured depth, metres; 0 or NaN = no measurement.
