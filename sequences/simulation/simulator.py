@@ -32,6 +32,7 @@ SOURCE = "simulation"
 UP = np.array([0.0, 0.0, 1.0])
 LAMP_M = (1.5, -1.3, 2.45)
 SILHOUETTE_PX = 160  # a silhouette is counted on a grid of at most so many samples each way
+NEAREST_M = 0.05  # vertices nearer than this say nothing of where a silhouette lies
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def _look(
     boxes = find_objects(images.item + 1, max_label=len(placed))
     counts = np.bincount(images.item.ravel() + 1, minlength=len(placed) + 1)[1:]
     visible = [
-        Visible(p.inst_id, p.shape.object_class.obj_id, _box(box), _visible_share(int(count), *item, camera))
+        Visible(p.inst_id, p.shape.object_class.obj_id, _box(box), *_visible_shares(int(count), *item, camera))
         for p, item, box, count in zip(placed, items, boxes, counts, strict=False)
     ]
     return images, visible
@@ -140,20 +141,26 @@ def _box(slices: tuple[slice, slice] | None) -> tuple[float, float, float, float
     return (float(columns.start), float(rows.start), float(columns.stop - columns.start), float(rows.stop - rows.start))
 
 
-def _visible_share(seen_px: int, mesh: Mesh, T_camera_object: Array, camera: Camera) -> float:
-    """Visible share of the silhouette, which may reach out of the image by its own size each way, as BOP counts it."""
+def _visible_shares(seen_px: int, mesh: Mesh, T_camera_object: Array, camera: Camera) -> tuple[float, float]:
+    """What share of a thing's silhouette is visible: of all of it, and of the part in the image.
+
+    As in BOP, "all" reaches out of the image by the image's own size each way. Large ones are counted on a coarse grid.
+    """
     if seen_px == 0:
-        return 0.0
+        return 0.0, 0.0
     points = se3.transform(T_camera_object, mesh.vertices)
-    pixels = camera.project(points[points[:, 2] > 0.05])
+    pixels = camera.project(points[points[:, 2] > NEAREST_M])
     size = np.array([camera.width, camera.height])
     low = np.floor(np.clip(pixels.min(axis=0), -size, size)).astype(int)
     high = np.ceil(np.clip(pixels.max(axis=0), 0, 2 * size)).astype(int)
     step = int(np.ceil((high - low + 1).max() / SILHOUETTE_PX))
     columns, rows = -(-(high - low + 1) // step)
     window = camera.window(int(low[0]), int(low[1]), int(columns), int(rows), step)
-    silhouette = int((render_scene([(mesh, T_camera_object)], window).item >= 0).sum()) * step * step
-    return min(1.0, seen_px / max(silhouette, 1))
+    silhouette = render_scene([(mesh, T_camera_object)], window).item >= 0
+    u, v = low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)
+    inside = ((v >= 0) & (v < camera.height))[:, None] & (u >= 0) & (u < camera.width)
+    seen = seen_px / step**2
+    return min(1.0, seen / max(int(silhouette.sum()), 1)), min(1.0, seen / max(int((silhouette & inside).sum()), 1))
 
 
 def _incidence(scene: LitScene, images: SceneImages, camera: Camera, T_world_camera: Array) -> Array:
