@@ -194,7 +194,7 @@ def _log_ratios(z, rendered, background, parameters, out):
 def depth_log_ratio(
     z: ArrayLike, rendered: ArrayLike, background: ArrayLike = 0.0, model: DepthModel | None = None
 ) -> Array:
-    """log of `pixel_ratio` over arrays that broadcast together.
+    """Log of `pixel_ratio` over arrays that broadcast together.
 
     Args:
         z: (...) measured depth, metres; 0 or NaN = no measurement.

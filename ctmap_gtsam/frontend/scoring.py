@@ -6,13 +6,14 @@ object depends on how large it appears and not on the camera's resolution.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.measurement import pixel_log_ratio
+from factors.measurement import pixel_ratio, pixel_without_object
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.geometry import Plane, plane_depth
@@ -20,6 +21,8 @@ from sequences.rendering.kernels import project, rasterise
 from sequences.rendering.rasteriser import coordinates, intrinsics
 
 Array = NDArray[np.float64]
+
+_SMALL, _LARGE = 1e-200, 1e200  # a pixel's ratio is far from both, so that a product can't leave float64 between tests
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,18 @@ class Scores:
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _score(vertices, faces, solid, poses, camera, depth, background, parameters, margin, out):
     height, width = depth.shape
+    without = np.empty((height, width, 4))
+    for v in range(height):
+        for u in range(width):
+            constants = pixel_without_object(depth[v, u], background[v, u], parameters)
+            for i in range(4):
+                without[v, u, i] = constants[i]
     for k in numba.prange(poses.shape[0]):
         projected = np.empty(vertices.shape)
         inverse_depth = np.zeros((height, width))
         project(vertices, poses[k], camera, projected)
         rasterise(projected, faces, solid, inverse_depth, None)
-        total = 0.0
+        total, product = 0.0, 1.0
         covered, visible = 0, 0
         u0, v0, u1, v1 = width, height, -1, -1
         for v in range(height):
@@ -95,12 +104,16 @@ def _score(vertices, faces, solid, poses, camera, depth, background, parameters,
                 if z == 0.0:
                     continue
                 rendered = 1.0 / w
-                total += pixel_log_ratio(z, rendered, background[v, u], parameters)
+                here = without[v, u]
+                product *= pixel_ratio(z, rendered, (here[0], here[1], here[2], here[3]), parameters)
+                if not _SMALL < product < _LARGE:  # one logarithm for many pixels
+                    total += math.log(product)
+                    product = 1.0
                 if z > rendered - margin:
                     visible += 1
                     u0, u1 = min(u0, u), max(u1, u)
                     v0, v1 = min(v0, v), max(v1, v)
-        out[k, 0], out[k, 1], out[k, 2] = total, covered, visible
+        out[k, 0], out[k, 1], out[k, 2] = total + math.log(product), covered, visible
         out[k, 3], out[k, 4], out[k, 5], out[k, 6] = u0, v0, u1, v1
 
 
@@ -243,7 +256,8 @@ def refine_on_depth(
         widths_m: (steps,) the robust width at each step, metres.
 
     Returns:
-        (K, 4, 4) refined poses, not all better than their start: score them; and (K, 6, 6) the last normal equations' J^T W J.
+        (K, 4, 4) refined poses, not all better than their start: score them; and (K, 6, 6) the J^T W J of the last
+        normal equations.
     """
     poses = np.array(T_camera_object, dtype=np.float64, order="C")
     camera = intrinsics(tile.camera)
