@@ -60,6 +60,22 @@ class Model:
         """(C, C) log pi(d | c): the class d that the detector persistently believes, for the true class c (columns d)."""
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
 
+    def view_share(self, before: Array, after: Array, dt_s: float) -> float:
+        """How much of a view is news, 0 to 1: the share its evidence counts.
+
+        What depth and detector get wrong of an object, they get wrong again in the next frame from the same side. So that
+        more frames of one view are not more evidence, a frame counts by how far the camera has moved around it.
+
+        Args:
+            before: (3,) from the object to the camera at the last view, metres, world frame.
+            after: (3,) the same now.
+            dt_s: seconds between.
+        """
+        sensor = self.config.sensor
+        a, b = np.linalg.norm(before), np.linalg.norm(after)
+        turned = np.arccos(np.clip(before @ after / (a * b), -1.0, 1.0)) + abs(np.log(b / a))
+        return float(min(1.0, turned / sensor.fresh_view_rad + dt_s / sensor.fresh_view_s))
+
     def log_likelihood(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
         """log phi_m (K,) of rendered hypotheses but for the class scores: tempered depth and the box, nats.
 

@@ -29,6 +29,8 @@ class Sensor:
     background_sigma_m: float = option(0.005, "how well a background plane's depth is known, metres", low=0.0)
     clutter_gain: float = option(2.5, "nats a sample that a surface of no known mesh would explain", low=0.0)
     kappa: float = option(0.03, "one over the number of samples whose noise is correlated", low=0.0, high=1.0)
+    fresh_view_rad: float = option(0.1, "change of viewing direction after which depth errs anew, rad", low=1e-3)
+    fresh_view_s: float = option(2.0, "time after which depth errs anew even in the same view, s", low=1e-3)
     occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
 
 
@@ -61,9 +63,10 @@ class Context:
     """Relations between objects."""
 
     relations: CategoryRelations = field(default_factory=CategoryRelations)
-    support_sigma_m: float = option(0.015, "how far a thing may float over or sink into its support, metres", low=1e-4)
+    support_tolerance_m: float = option(0.005, "gaps and dents up to this are errors of the surface, metres", low=0.0)
+    support_sigma_m: float = option(0.015, "how far beyond that a thing may seem to float, metres", low=1e-4)
     other_support: float = option(0.02, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)
-    penetration_sigma_m: float = option(0.01, "how deep objects may seem to intersect, metres", low=1e-4)
+    penetration_sigma_m: float = option(0.005, "how deep a thing may seem to sink into another, metres", low=1e-4)
 
 
 @dataclass(frozen=True)

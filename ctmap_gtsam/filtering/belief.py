@@ -58,6 +58,8 @@ class Belief:
     visit: int
     time_ns: int
     """of the last keyframe that had it in view"""
+    viewpoint: Array
+    """(3,) from the object to the camera at that keyframe, metres, world frame"""
     visible: bool
     steps: int
     """keyframes in view since the start"""
@@ -144,9 +146,11 @@ class Updater:
             log_elsewhere=-np.inf,
             visit=observation.frame.visit,
             time_ns=observation.frame.time_ns,
+            viewpoint=np.zeros(3),
             visible=True,
             steps=1,
         )
+        fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation))
         return replace(fresh, log_clutter=self._clutter(fresh, view, observation))
 
     def step(
@@ -158,7 +162,10 @@ class Updater:
         if box is None:
             return replace(belief, visible=False)
         belief = self._allow_move(belief, observation)
-        view = self.proposer.view(observation, box, detection, around)
+        viewpoint = self._viewpoint(belief, observation)
+        waited = (observation.frame.time_ns - belief.time_ns) * 1e-9
+        share = self.model.view_share(belief.viewpoint, viewpoint, waited)
+        view = self.proposer.view(observation, box, detection, around, share)
         likely = belief.class_log_evidence(self.model)
         counts = self._counts(likely)
         classes = tuple(
@@ -171,6 +178,7 @@ class Updater:
             classes=classes,
             score_sum=scores,
             time_ns=observation.frame.time_ns,
+            viewpoint=viewpoint,
             visible=True,
             steps=belief.steps + 1,
         )
@@ -235,6 +243,12 @@ class Updater:
         T = observation.frame.T_camera_world @ own.particles.best(1)[0]
         seen = outlook(self.model.shapes[best], T, observation.frame.camera)
         return seen.box if seen.share > 0.0 and (seen.box[2:] >= 2.0).all() else None
+
+    def _viewpoint(self, belief: Belief, observation: Observation) -> Array:
+        """From the object to the camera, (3,) metres, world frame."""
+        own = belief.classes[int(np.argmax(belief.class_log_evidence(self.model)))]
+        camera = observation.frame.T_world_camera[:3, 3]
+        return camera if own is None else camera - own.particles.best(1)[0, :3, 3]
 
     def _allow_move(self, belief: Belief, observation: Observation) -> Belief:
         """After a significant absence the object stayed with S(dt) (Equation 3), or is where nobody has looked."""
@@ -351,10 +365,11 @@ class Updater:
         _, scores = self.proposer.score(self.model.shapes[best], view, T)
         gain = self.model.kappa * self.model.config.sensor.clutter_gain * float(scores.visible[0])
         if view.detection is None:
-            return float(np.log1p(-rate))
+            return view.share * float(np.log1p(-rate))
         # the box of clutter is as good as the best box of an object
         box = np.array(view.detection.box)
-        return gain + float(np.log(rate)) + float(self.model.box(box, box[None], view.image_size)[0])
+        matched = float(self.model.box(box, box[None], view.image_size)[0])
+        return view.share * (gain + float(np.log(rate)) + matched)
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(

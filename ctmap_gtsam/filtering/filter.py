@@ -7,6 +7,8 @@ weights account for; the context multiplies the reported posterior once, not onc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,26 +73,44 @@ class _State:
         """Algorithm 1 for every object: neighbours are those of the keyframe before, so the order of objects is nothing."""
         self.associator.step(observation)
         self.gravity.update(observation)
-        surroundings = Surroundings.of(observation, self.gravity, self._neighbours())
+        before = self.reports[-1] if self.reports else {}
         reported: dict[int, Reported] = {}
-        for track in self.associator.tracks():
-            i = track.track_id
-            around = surroundings.without(i)
+        surroundings = self._surroundings(observation, before)
+        known = [track for track in self.associator.tracks() if track.track_id in self.beliefs]
+        for track in known:
+            i, around = track.track_id, surroundings.without(track.track_id)
             detection = track.at(observation.keyframe)
-            if i not in self.beliefs:
-                self.beliefs[i] = self.updater.start(track, observation, around)
-            else:
-                self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
+            self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
             reported[i] = self.updater.report(self.beliefs[i], observation, around)
-        self.reports.append(reported)
+        self.reports.append(reported | self._start(observation, before))
 
-    def _neighbours(self) -> tuple[Neighbour, ...]:
-        """Objects of the keyframe before that are sure, by their most likely particle."""
-        if not self.reports:
-            return ()
+    def _start(self, observation: Observation, before: Mapping[int, Reported]) -> dict[int, Reported]:
+        """Beliefs of tracks that have just become consistent.
+
+        They know no neighbours among themselves yet, so all start a second time beside those that were sure of themselves.
+        """
+        new = [track for track in self.associator.tracks() if track.track_id not in self.beliefs]
+        started: dict[int, Belief] = {}
+        reported: dict[int, Reported] = {}
+        for _ in range(2 if len(new) > 1 else 1):
+            surroundings = self._surroundings(observation, {**before, **reported})
+            for track in new:
+                around = surroundings.without(track.track_id)
+                started[track.track_id] = self.updater.start(track, observation, around)
+            reported = {
+                i: self.updater.report(belief, observation, surroundings.without(i)) for i, belief in started.items()
+            }
+        self.beliefs |= started
+        return reported
+
+    def _surroundings(self, observation: Observation, reports: Mapping[int, Reported]) -> Surroundings:
+        return Surroundings.of(observation, self.gravity, self._neighbours(reports))
+
+    def _neighbours(self, reports: Mapping[int, Reported]) -> tuple[Neighbour, ...]:
+        """Objects that are sure of themselves, by their most likely particle."""
         return tuple(
             Neighbour(i, self.model.shapes[r.best_class], r.best_pose)
-            for i, r in sorted(self.reports[-1].items())
+            for i, r in sorted(reports.items())
             if r.best_pose is not None
             and r.existence > NEIGHBOUR_PROBABILITY
             and r.class_probability[r.best_class] > NEIGHBOUR_PROBABILITY

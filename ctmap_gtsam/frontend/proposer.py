@@ -38,6 +38,8 @@ class View:
     detection: Detection | None
     image_size: tuple[int, int]
     """width, height"""
+    share: float = 1.0
+    """of the view that is news: its evidence is raised to this power"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,12 @@ class Proposer:
         self._fine = np.full(max(1, steps - len(self._coarse)), last)
 
     def view(
-        self, observation: Observation, box: Array, detection: Detection | None, surroundings: Surroundings | None = None
+        self,
+        observation: Observation,
+        box: Array,
+        detection: Detection | None,
+        surroundings: Surroundings | None = None,
+        share: float = 1.0,
     ) -> View:
         """The region of a box (x, y, w, h) enlarged by the margin.
 
@@ -81,6 +88,7 @@ class Proposer:
             box: where the object is looked for, pixels.
             detection: the track's detection here, if there is one.
             surroundings: whose neighbours join the background.
+            share: see `Model.view_share`.
         """
         camera = observation.frame.camera
         x, y, w, h = box
@@ -90,7 +98,7 @@ class Proposer:
         tile = cut_tile(camera, observation.depth, observation.planes, region, step)
         if surroundings is not None:
             tile = surroundings.behind(tile, observation.frame.T_camera_world)
-        return View(tile, detection, (camera.width, camera.height))
+        return View(tile, detection, (camera.width, camera.height), share)
 
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
         """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
@@ -98,7 +106,7 @@ class Proposer:
         scores = score_depth(
             shape.mesh, view.tile, T_camera_centre, self.model.depth_parameters, self.model.config.sensor.occlusion_margin_m
         )
-        return self.model.log_likelihood(scores, view.detection, view.image_size), scores
+        return view.share * self.model.log_likelihood(scores, view.detection, view.image_size), scores
 
     def search(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0) -> Array:
         """A fresh search in a view with a detection: refined poses (K, 4, 4), not yet sorted out.
@@ -128,7 +136,7 @@ class Proposer:
         keep = self._distinct(shape, candidates, score)
         poses = candidates[keep]
         covariance, free = self._shape_of_score(shape, view, poses, scores.log_ratio[keep], probe)
-        return PoseModes(poses, score[keep], self.model.kappa * scores.log_ratio[keep], covariance, free)
+        return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance, free)
 
     def _draw(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int) -> Array | None:
         """The paper's first particles: (n, 4, 4)."""
@@ -185,13 +193,13 @@ class Proposer:
         unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
         directions = np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)  # (n, 6 directions, 6)
         if not probe:
-            return self._laplace(hessian, unit), np.zeros((len(poses), 6, 3))
+            return self._laplace(view.share * hessian, unit), np.zeros((len(poses), 6, 3))
         steps = np.concatenate([_LADDER_M, -_LADDER_M])
         offsets = directions[:, :, None] * steps[:, None] * unit
         moved = se3.retract(poses[:, None, None], offsets).reshape(-1, 4, 4)
         depth = score_depth(shape.mesh, view.tile, moved, self.model.depth_parameters, 0.0).log_ratio
         self.hypotheses_scored += len(moved)
-        drop = self.model.kappa * (log_ratio[:, None, None] - depth.reshape(len(poses), 6, -1))
+        drop = view.share * self.model.kappa * (log_ratio[:, None, None] - depth.reshape(len(poses), 6, -1))
         sigma, flat = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
         scaled = directions * unit
         covariance = np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled)

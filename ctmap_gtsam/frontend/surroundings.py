@@ -119,18 +119,23 @@ def penetration_depth(shape: Shape, points: Array) -> Array:
 
 
 def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:
-    """How well poses (K, 4, 4) rest on a level surface, nats (K,): a hinge on the gap, either way, floored.
+    """How well poses (K, 4, 4) stand on the level surfaces, nats (K,); 0 where none is known.
 
-    The floor says that a thing may rest on something that was not seen. 0 where no surface is known below.
+    Floating over the nearest surface below is a hinge with a floor: a thing may rest on something that was not seen.
+    Sinking into one has no floor: surfaces are solid. A thing wholly beneath a surface has nothing to do with it.
     """
     settings = model.config.context
-    best = np.full(len(T_world_centre), -np.inf)
+    gap = np.full(len(T_world_centre), np.inf)
+    sunk = np.zeros(len(T_world_centre))
     for plane in supports:
         heights = se3.transform(T_world_centre, shape.hull_points) @ plane.normal - plane.offset
-        potential = hinge_log_potential(np.abs(heights.min(axis=-1)), settings.support_sigma_m)
-        above = plane.contains(T_world_centre[:, :3, 3])
-        best = np.where(above, np.maximum(best, potential), best)
-    return np.where(np.isneginf(best), 0.0, np.logaddexp(best, np.log(settings.other_support)))
+        low, high = heights.min(axis=-1), heights.max(axis=-1)
+        concerned = plane.contains(T_world_centre[:, :3, 3]) & (high > 0.0)
+        gap = np.where(concerned, np.minimum(gap, np.maximum(low, 0.0)), gap)
+        sunk = np.where(concerned, np.maximum(sunk, -low), sunk)
+    floating = hinge_log_potential(gap - settings.support_tolerance_m, settings.support_sigma_m)
+    resting = np.where(np.isinf(gap), 0.0, np.logaddexp(floating, np.log(settings.other_support)))
+    return resting + hinge_log_potential(sunk - settings.support_tolerance_m, settings.penetration_sigma_m)
 
 
 def level_planes(observation: Observation, up_world: Array | None) -> tuple[Plane, ...]:
