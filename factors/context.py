@@ -57,8 +57,9 @@ class CategoryRelations:
 
     same_category: Relation = Relation()
     """pairs of classes that share a category"""
-    pairs: tuple[tuple[str, str, Relation], ...] = ()
-    """class or category names in either order, and how they are related; class names go before categories"""
+    pairs: tuple[tuple[str, str, Relation], ...] = option(
+        (), "[class or category, the same, relation] in either order; class names go before categories"
+    )
     area_m2: float = option(4.0, "area over which unrelated things are spread, square metres", low=1e-3)
     category_weight: float = option(0.5, "w1 of the paper; w2 is the rest", low=0.0, high=1.0)
 

@@ -1,8 +1,8 @@
 """Any tree of frozen dataclasses made of `sequences.options.option` fields: read, checked, changed and written as TOML.
 
-The leaves are bool, int, float, str, a Literal of those, a tuple of those, or one of them `| None` with default None
-(TOML has no null, so what is None is written as a comment). Numbers are finite. Wrong input raises InputError naming
-the setting by its dotted path and, for an unknown one, the nearest that exists.
+The leaves are bool, int, float, str, a Literal of those, a tuple of leaves or of dataclasses, or one of these `| None`
+with default None (TOML has no null, so what is None is written as a comment). Numbers are finite. Wrong input raises
+InputError naming the setting by its dotted path and, for an unknown one, the nearest that exists.
 """
 
 from __future__ import annotations
@@ -48,14 +48,17 @@ def check(settings: Any) -> None:
 
 def to_dict(settings: Any) -> dict[str, Any]:
     """Nested dicts as JSON takes them; `merge` of any tree of the type with them gives `settings` again."""
-    out: dict[str, Any] = {}
-    for f in fields(settings):
-        value = getattr(settings, f.name)
-        if is_dataclass(value):
-            out[f.name] = to_dict(value)
-        else:
-            out[f.name] = list(value) if isinstance(value, tuple) else value
-    return out
+    return {f.name: _plain(getattr(settings, f.name)) for f in fields(settings)}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return to_dict(value)
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 
 def to_toml(settings: Any) -> str:
@@ -131,7 +134,7 @@ class _Merge:
             if is_dataclass(kind):
                 new[name] = self.section(getattr(settings, name), value, inner)
             else:
-                new[name] = self.leaf(f, kind, tuple(value) if isinstance(value, list) else value, inner)
+                new[name] = self.leaf(f, kind, _tuples(value), inner)
         try:
             return replace(settings, **new)  # type: ignore[type-var]
         except ValueError as error:  # from a section's own __post_init__
@@ -143,6 +146,8 @@ class _Merge:
             if value is None:
                 return None
             kind = next(k for k in get_args(kind) if k is not types.NoneType)
+        if is_dataclass(kind):
+            return self.section(kind(), to_dict(value) if isinstance(value, kind) else value, path)  # type: ignore
         if get_origin(kind) is tuple:
             return self._tuple(f, kind, value, path)
         if get_origin(kind) is Literal:
@@ -240,7 +245,7 @@ def _fill(table: Any, settings: Any) -> None:
         if value is None:
             table.add(tomlkit.comment(f"{f.name} is not set"))
         else:
-            table.add(f.name, list(value) if isinstance(value, tuple) else value)
+            table.add(f.name, _item(value))
     for name, value in sections:
         section = tomlkit.table()
         for line in cleandoc(type(value).__doc__ or "").splitlines():
@@ -250,11 +255,27 @@ def _fill(table: Any, settings: Any) -> None:
         table.add(name, section)
 
 
+def _item(value: Any) -> tomlkit.items.Item:
+    """On one line: a list of tables of its own would swallow the settings after it."""
+    if is_dataclass(value):
+        table = tomlkit.inline_table()
+        for f in fields(value):
+            inner = getattr(value, f.name)
+            if inner is not None:
+                table.append(f.name, _item(inner))
+        return table
+    if isinstance(value, tuple):
+        array = tomlkit.array()
+        for inner in value:
+            array.append(_item(inner))
+        return array
+    return tomlkit.item(value)
+
+
 def _comment(f: Field[Any], kind: Any) -> str:
     parts = [" ".join(f.metadata.get("doc", "").split()) + _bounds(f)]
     if get_origin(kind) is Literal:
         parts.append("one of " + ", ".join(repr(choice) for choice in get_args(kind)))
     if f.default is not MISSING and f.default is not None:
-        default = list(f.default) if isinstance(f.default, tuple) else f.default
-        parts.append(f"default {tomlkit.item(default).as_string()}")
+        parts.append(f"default {_item(f.default).as_string()}")
     return "; ".join(part for part in parts if part)

@@ -39,6 +39,7 @@ class Section:
     path: str | None = option(None, "may be missing")
     limit: float | None = option(None, "may be missing", low=0.0)
     deep: Deep = field(default_factory=Deep)
+    pairs: tuple[tuple[str, Deep], ...] = option((), "named sections")
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ sections = st.builds(
     path=st.none() | st.text(),
     limit=st.none() | st.floats(0.0, 1e300),
     deep=deeps,
+    pairs=st.lists(st.tuples(st.text(), deeps), max_size=2).map(tuple),
 )
 trees = st.builds(Tree, seed=st.integers(0, 2**130), section=sections, other=deeps)
 
@@ -101,7 +103,7 @@ def test_every_setting_can_be_assigned(tree: Tree) -> None:
             if isinstance(value, dict):
                 out += assignments(value, f"{prefix}{name}.")
             else:
-                out.append(f"{prefix}{name}={tomlkit.item(value).as_string()}")
+                out.append(f"{prefix}{name}={tomlkit.item(value, _parent=tomlkit.array()).as_string()}")
         return out
 
     changes = settings.parse_assignments(assignments(values, ""))
@@ -115,7 +117,7 @@ def test_every_setting_says_what_it_is_and_rejects_another_type(path: str) -> No
     for section in sections:
         owner = getattr(owner, section)
     f = next(f for f in fields(owner) if f.name == name)
-    assert f.metadata["doc"], f"{path} has no sentence"
+    assert f.metadata.get("doc"), f"{path} has no sentence"
     change: Any = {name: {"not": "a leaf"}}
     for section in reversed(sections):
         change = {section: change}
@@ -151,6 +153,9 @@ def test_the_printed_defaults_are_the_defaults() -> None:
         ({"section": {"limit": -1.0}}, "section.limit"),
         ({"section": {"deep": {"choice": "middle"}}}, "section.deep.choice"),
         ({"section": {"deep": {"grid": [1.0, -11.0]}}}, "section.deep.grid[1]"),
+        ({"section": {"pairs": [["a", {"choice": "middle"}]]}}, "section.pairs[0][1].choice"),
+        ({"section": {"pairs": [["a", {"grids": []}]]}}, "section.pairs[0][1].grids"),
+        ({"section": {"pairs": [["a", 1.0]]}}, "section.pairs[0][1]"),
         ({"section": 3}, "section"),
         ({"seed": {"a": 1}}, "seed"),
     ],
