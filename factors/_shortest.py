@@ -1,8 +1,8 @@
 """The residual between two poses modulo symmetry, compiled for one pair at a time.
 
 A graph is linearised factor by factor. There the batched NumPy functions of `sequences.se3` cost 1 ms a pair in call
-overhead, these kernels 30 microseconds; the tests hold both to each other. Formulas: Barfoot, State Estimation for Robotics
-(2017), ch. 7.
+overhead, these kernels 30 microseconds; the tests hold both to each other. Formulas: Barfoot, State Estimation for
+Robotics (2017), ch. 7.
 """
 
 import math
