@@ -6,6 +6,10 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from ctmap_gtsam.runtime.threads import limit_library_threads
+
+limit_library_threads()  # as the command does, and before NumPy is imported
+
 ROOT = Path(__file__).parents[1]
 RECORDINGS = ("ycb_desk", "visp_rbt", "tum_cabinet")
 
