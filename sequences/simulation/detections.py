@@ -20,11 +20,11 @@ from sequences.types import Detection
 
 Array = NDArray[np.float64]
 
-LEAST_VISIBLE = 0.08  # share of the silhouette, and
+LEAST_EVIDENCE = 0.1  # see Visible.evidence, and
 LEAST_SIDE = 0.012  # share of the image's width: less than either is never found
 JITTER = 0.03  # of each edge of a box, as a share of its side
 MISSED = 0.08  # of things in plain view
-HALF_HIDDEN = 0.3  # the visible share at which occlusion alone costs half of the detections
+HALF_HIDDEN = 0.3  # the evidence at which occlusion alone costs half of the detections
 FALSE_POSITIVES = 0.12  # an image
 CONFUSED = 0.15  # of the time that a thing is taken for one wrong class ...
 STRETCH = 8.0  # ... for so many images on end, on average
@@ -50,7 +50,14 @@ class Visible:
     box: tuple[float, float, float, float]
     """x, y, width, height of its visible pixels"""
     fraction: float
-    """visible share of its silhouette"""
+    """visible share of its silhouette, the part outside the image included: BOP's visib_fract"""
+    unoccluded: float
+    """visible share of the part of its silhouette that lies in the image"""
+
+    @property
+    def evidence(self) -> float:
+        """How much of it there is to recognise, 0 to 1: to be cut by the image's edge harms less than to be hidden."""
+        return float(np.sqrt(self.fraction * self.unoccluded))
 
 
 class Detector:
@@ -138,11 +145,11 @@ def _detect(
     chance = rng.random()
     if not config.furniture and not catalogue[visible.obj_id].movable:
         return []
-    if chance >= detection_probability(visible.fraction, visible.box, image_size, config.noise):
+    if chance >= detection_probability(visible, image_size, config.noise):
         return []
     lead = min(SURE, CERTAINTY / max(config.noise, 1e-6)) + min(config.noise, 1.0) * rng.standard_normal()
     scores = config.noise * rng.standard_normal(1 + len(catalogue))
-    scores[0] += config.noise * 1.5 * (1.0 - visible.fraction)
+    scores[0] += config.noise * 1.5 * (1.0 - visible.evidence)
     scores[1 + believed] += lead
     truth = catalogue.index(visible.obj_id)
     if believed != truth:
@@ -150,13 +157,11 @@ def _detect(
     return [Detection(_jittered(visible.box, image_size, config.noise, rng), _softmax(scores))]
 
 
-def detection_probability(
-    fraction: float, box: tuple[float, float, float, float], image_size: tuple[int, int], noise: float
-) -> float:
-    """Probability of finding a thing of which a fraction is visible, in a box (x, y, width, height)."""
-    if fraction < LEAST_VISIBLE or max(box[2], box[3]) < LEAST_SIDE * image_size[0]:
+def detection_probability(visible: Visible, image_size: tuple[int, int], noise: float) -> float:
+    """Probability of finding a thing in an image (width, height)."""
+    if visible.evidence < LEAST_EVIDENCE or max(visible.box[2:]) < LEAST_SIDE * image_size[0]:
         return 0.0
-    in_spite_of_occlusion = 1.0 / (1.0 + np.exp(-(fraction - HALF_HIDDEN) / 0.08))
+    in_spite_of_occlusion = 1.0 / (1.0 + np.exp(-(visible.evidence - HALF_HIDDEN) / 0.08))
     return float(max(0.0, 1.0 - MISSED * noise) * in_spite_of_occlusion**noise)
 
 

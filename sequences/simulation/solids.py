@@ -141,7 +141,7 @@ def _box_grid(lines: Sequence[Array]) -> Solid:
             faces.append(start + (quads if side == -1 else quads[:, ::-1]))
             vertices.append(points)
             start += p.size
-    stacked: Array = np.round(np.concatenate(vertices), 9)
+    stacked = np.concatenate(vertices).round(9)
     unique, inverse = np.unique(stacked, axis=0, return_inverse=True)
     return unique, inverse.reshape(-1)[np.concatenate(faces)].astype(np.int32)
 
