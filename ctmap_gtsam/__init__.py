@@ -38,7 +38,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """PEP 562: import a public name's module when the name is first used, so that `ctmap --help` imports none of them."""
+    """Import a public name's module when the name is first used (PEP 562), so that `ctmap --help` imports none."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)

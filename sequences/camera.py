@@ -59,4 +59,4 @@ class Camera:
     def points(self, depth: NDArray[np.float32]) -> Array:
         """Depth image (h, w), metres -> points (h, w, 3) in the camera frame; zero where depth is 0."""
         v, u = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
-        return self.backproject(u, v, depth)
+        return self.backproject(u, v, depth.astype(np.float64))

@@ -15,9 +15,7 @@ class InputError(Exception):
         remedy: what the user can do about it.
     """
 
-    def __init__(
-        self, message: str, *, file: Path | str | None = None, field: str = "", remedy: str = ""
-    ) -> None:
+    def __init__(self, message: str, *, file: Path | str | None = None, field: str = "", remedy: str = "") -> None:
         super().__init__(message)
         self.message = message
         self.file = None if file is None else Path(file)

@@ -135,9 +135,7 @@ def _normals(grid: Array) -> tuple[Array, NDArray[np.bool_]]:
     return normals * np.where(towards == 0, 1.0, towards), usable
 
 
-def _best_candidate(
-    points: Array, normals: Array, rng: np.random.Generator, search: PlaneSearch
-) -> NDArray[np.bool_]:
+def _best_candidate(points: Array, normals: Array, rng: np.random.Generator, search: PlaneSearch) -> NDArray[np.bool_]:
     picks = rng.integers(len(points), size=search.candidates)
     n = normals[picks]
     tolerance = search.tolerance_per_m * points[:, 2]

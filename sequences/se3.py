@@ -1,4 +1,4 @@
-"""Rigid motions as batched 4x4 matrices, GTSAM's conventions: tangent [rotation rad, translation m], right perturbation.
+"""Rigid motions as batched 4x4 matrices, by GTSAM's rules: tangent [rotation rad, translation m], right perturbation.
 
 ``T_a_b`` maps points of frame b to frame a. ``retract(T, xi) = T @ exp(xi)`` and ``local(A, B) = log(A^-1 B)``.
 Formulas: Barfoot, State Estimation for Robotics (2017), ch. 7; Sola et al., A micro Lie theory (arXiv:1812.01537).
@@ -153,7 +153,8 @@ def right_jacobian(xi: Array) -> Array:
 
 def right_jacobian_inverse(xi: Array) -> Array:
     """(..., 6) -> (..., 6, 6): log(exp(xi) exp(d)) ~ xi + J_r^-1(xi) d."""
-    return np.linalg.inv(right_jacobian(xi))
+    inverse: Array = np.linalg.inv(right_jacobian(xi))
+    return inverse
 
 
 def _left_jacobian(xi: Array) -> Array:
@@ -166,9 +167,7 @@ def _left_jacobian(xi: Array) -> Array:
     a2 = angle * angle
     c1 = np.where(small, 1 / 6 - a2 / 120 + a2 * a2 / 5040, (a - np.sin(a)) / a**3)
     c2 = np.where(small, 1 / 24 - a2 / 720 + a2 * a2 / 40320, (a * a + 2 * np.cos(a) - 2) / (2 * a**4))
-    c3 = np.where(
-        small, 1 / 120 - a2 / 2520 + a2 * a2 / 120960, (2 * a - 3 * np.sin(a) + a * np.cos(a)) / (2 * a**5)
-    )
+    c3 = np.where(small, 1 / 120 - a2 / 2520 + a2 * a2 / 120960, (2 * a - 3 * np.sin(a) + a * np.cos(a)) / (2 * a**5))
     c1, c2, c3 = (c[..., None, None] for c in (c1, c2, c3))
     WV, VW, WVW = W @ V, V @ W, W @ V @ W
     Q = 0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3 * WVW) + c3 * (WVW @ W + W @ WVW)

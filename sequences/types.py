@@ -1,4 +1,4 @@
-"""What a recorded run is made of. Poses are (4, 4) float64 ``T_a_b`` ("b in a") in metres; times are integer nanoseconds."""
+"""What a recorded run is made of. Poses are (4, 4) float64 ``T_a_b`` ("b in a"), metres; times integer nanoseconds."""
 
 from __future__ import annotations
 
