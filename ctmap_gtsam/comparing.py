@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -213,6 +214,7 @@ def _run_method(run: Run, method: Method, config: Config, store: Path | None, pr
     return Outcome("ok", seconds, estimate)
 
 
+@cache
 def _code() -> str:
     """SHA-256 over the source that estimates: an estimate of other code is another estimate."""
     digest = hashlib.sha256()

@@ -1,8 +1,8 @@
 """What an estimator says of a run: the one result type of filter, fixed lag and smoother.
 
 Everything downstream (metrics, tables, plots, exports, notebooks) knows only this type. It imports no estimator.
-On disk it is one .npz without pickle, described in docs/format.md, so that NumPy alone can read it. Two runs with the same
-input, configuration and seed give the same bytes.
+On disk it is one .npz without pickle, described in docs/format.md, so that NumPy alone can read it. Two runs with the
+same input, configuration and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -27,6 +28,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SCHEMA = 1
+
+_BROKEN = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
+"""What NumPy and we raise on files that aren't estimates"""
 
 
 @dataclass(frozen=True)
@@ -164,8 +168,9 @@ class Estimate:
 
         Args:
             time_ns: UTC, nanoseconds. Before the first keyframe the map is that of the first.
-            T_world_camera: the recorded camera pose (4, 4) at that time; where given together with the recorded pose of
-                the keyframe (`meta["recorded_T_world_camera"]`), the estimated camera is carried by the recorded motion.
+            T_world_camera: the recorded camera pose (4, 4) at that time; where given together with the recorded pose
+                of the keyframe (`meta["recorded_T_world_camera"]`), the estimated camera is carried by the recorded
+                motion.
         """
         k = max(int(np.searchsorted(self.keyframe_time_ns, time_ns, side="right")) - 1, 0)
         return self.at_keyframe(k, T_world_camera)
@@ -200,7 +205,7 @@ class Estimate:
             meta = json.loads(str(arrays.pop("meta")))
             if meta.get("schema") == SCHEMA:
                 return _unpack(arrays, meta)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        except _BROKEN as error:
             raise InputError(
                 f"not an estimate ({error})", file=path, remedy="delete it and run the method again"
             ) from error
@@ -235,7 +240,7 @@ def _unpack(arrays: dict[str, Any], meta: dict[str, Any]) -> Estimate:
         name: kind(**{f.name: arrays.pop(f"{name}.{f.name}") for f in fields(kind)})
         for name, kind in {"modes": Modes, "moves": Moves, "ledger": Ledger}.items()
     }
-    return Estimate(**arrays, **parts, meta=meta)  # type: ignore[arg-type]
+    return Estimate(**arrays, **parts, meta=meta)
 
 
 def _pack(estimate: Estimate) -> bytes:

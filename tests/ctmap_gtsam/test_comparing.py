@@ -1,0 +1,219 @@
+"""`compare_run`: what is in the folder, what is taken from it again, and that no kill leaves half a file."""
+
+import hashlib
+import json
+import multiprocessing
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctmap_gtsam.comparing import compare_run, report, run_methods
+from ctmap_gtsam.config import Config
+from ctmap_gtsam.estimate import Estimate
+from sequences.bop import load_run, load_truth
+from sequences.errors import InputError
+from tests.ctmap_gtsam import synthetic
+
+
+@dataclass(frozen=True)
+class Fake:
+    """A method that knows the truth, and counts how often it ran."""
+
+    name: str
+    kind: str = "estimate"
+    metres: float = 0.0
+    reason: str | None = None
+    ran: Any = None
+
+    def skip(self, run):
+        return self.reason
+
+    def run(self, run, config, progress):
+        assert self.kind == "estimate"
+        if self.ran is not None:
+            self.ran.append(self.name)
+        meta = {"method": self.name, "seed": config.seed}
+        return synthetic.estimate_of(run, load_truth(run), disturb=synthetic.shifted(self.metres), meta=meta)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return synthetic.write_run(tmp_path_factory.mktemp("run") / "small", frames=4)
+
+
+@pytest.fixture
+def ran():
+    return []
+
+
+@pytest.fixture
+def registry(ran):
+    methods = (
+        Fake("detector", kind="detections"),
+        Fake("icp", reason="Open3D can't be loaded"),
+        Fake("filter-ct", metres=0.003, ran=ran),
+        Fake("smooth-ct", ran=ran),
+    )
+    return {method.name: method for method in methods}
+
+
+def summary_of(out: Path) -> dict:
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads((out / "summary.json").read_text(), parse_constant=refuse)
+
+
+def test_the_folder_holds_everything(path, tmp_path, registry):
+    comparison = compare_run(path, tmp_path, Config(seed=3), registry=registry)
+    found = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert found == {
+        "summary.json",
+        "report.html",
+        "detector.json",
+        *(f"{m}.{kind}" for m in ("filter-ct", "smooth-ct") for kind in ("csv", "json")),
+        *(f"estimates/{m}.{kind}" for m in ("filter-ct", "smooth-ct") for kind in ("npz", "json")),
+    }
+    summary = summary_of(tmp_path)
+    assert summary["schema"] == 1
+    assert summary["seed"] == 3
+    assert summary["versions"]["numpy"] == np.__version__
+    methods = summary["methods"]
+    assert list(methods) == ["detector", "icp", "filter-ct", "smooth-ct"]
+    assert methods["icp"]["status"] == "skipped"
+    assert "Open3D" in methods["icp"]["reason"]
+    assert methods["filter-ct"]["status"] == "ok"
+    assert methods["filter-ct"]["seconds"] > 0
+    assert methods["filter-ct"]["metrics"]["mssd_mm_median"] == pytest.approx(3.0, abs=1e-6)
+    assert methods["filter-ct"]["metrics"]["objects"]["clay_brick"]["mssd_mm_median"] == pytest.approx(3.0, abs=1e-6)
+    assert methods["detector"]["metrics"]["mssd_mm_median"] is None
+    assert methods["detector"]["metrics"]["class_accuracy"] == pytest.approx(2 / 3)
+    assert comparison.methods["smooth-ct"].metrics["class_accuracy"] == 1
+    for name, digest in summary["files"].items():
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
+
+
+def test_nothing_is_written_into_the_run(path, tmp_path, registry):
+    before = {p: p.stat().st_mtime_ns for p in path.rglob("*")}
+    compare_run(path, tmp_path, Config(), registry=registry)
+    assert {p: p.stat().st_mtime_ns for p in path.rglob("*")} == before
+
+
+def test_what_is_there_is_taken_again(path, tmp_path, registry, ran):
+    compare_run(path, tmp_path, Config(), ["smooth-ct"], registry=registry)
+    compare_run(path, tmp_path, Config(), registry=registry)
+    assert ran == ["smooth-ct", "filter-ct"]
+    first = summary_of(tmp_path)
+    compare_run(path, tmp_path, Config(), registry=registry)
+    assert ran == ["smooth-ct", "filter-ct"]
+    assert summary_of(tmp_path) == first
+
+
+@pytest.mark.parametrize("change", ["seed", "estimate", "about", "missing", "code"])
+def test_what_differs_is_made_again(path, tmp_path, registry, ran, monkeypatch, change):
+    run = load_run(path)
+    run_methods(run, ["smooth-ct"], Config(), tmp_path, registry=registry)
+    estimate, about = tmp_path / "smooth-ct.npz", tmp_path / "smooth-ct.json"
+    whole = estimate.read_bytes()
+    config = Config(seed=1) if change == "seed" else Config()
+    if change == "estimate":
+        estimate.write_bytes(whole[:500])
+    elif change == "about":
+        about.write_text("{")
+    elif change == "missing":
+        about.unlink()
+    elif change == "code":
+        monkeypatch.setattr("ctmap_gtsam.comparing._code", lambda: "other")
+    outcome = run_methods(run, ["smooth-ct"], config, tmp_path, registry=registry)["smooth-ct"]
+    assert ran == ["smooth-ct"] * 2
+    if change != "seed":
+        assert estimate.read_bytes() == whole
+    assert Estimate.load(estimate).meta["seed"] == outcome.estimate.meta["seed"] == config.seed
+
+
+def test_another_recording_is_another_estimate(path, tmp_path, registry, ran):
+    other = synthetic.write_run(tmp_path / "other", frames=5)
+    for run in (path, other):
+        run_methods(load_run(run), ["smooth-ct"], Config(), tmp_path / "estimates", registry=registry)
+    assert ran == ["smooth-ct"] * 2
+
+
+def test_an_unknown_method_is_named_before_anything_runs(path, tmp_path, registry, ran):
+    with pytest.raises(InputError, match="ctmap") as caught:
+        compare_run(path, tmp_path / "out", Config(), ["smooth-ct", "ctmap"], registry=registry)
+    assert "smooth-ct" in caught.value.remedy
+    assert not ran
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bad_run_writes_nothing(tmp_path, registry):
+    with pytest.raises(InputError):
+        compare_run(tmp_path / "nowhere", tmp_path / "out", Config(), registry=registry)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_report_is_made_again_from_the_folder(path, tmp_path, registry):
+    compare_run(path, tmp_path, Config(), registry=registry)
+    page = (tmp_path / "report.html").read_text()
+    (tmp_path / "report.html").unlink()
+    assert report(tmp_path) == tmp_path / "report.html"
+    assert (tmp_path / "report.html").read_text() == page
+
+
+@pytest.mark.parametrize("damage", ["empty", "no json", "schema", "no estimate", "changed run"])
+def test_a_folder_that_is_no_comparison_is_refused(path, tmp_path, registry, damage):
+    if damage != "empty":
+        compare_run(path, tmp_path, Config(), ["smooth-ct"], registry=registry)
+    summary = tmp_path / "summary.json"
+    if damage == "no json":
+        summary.write_text("{")
+    elif damage == "schema":
+        summary.write_text("{}")
+    elif damage == "no estimate":
+        (tmp_path / "estimates" / "smooth-ct.npz").unlink()
+    elif damage == "changed run":
+        about = json.loads(summary.read_text())
+        about["run"]["fingerprint"] = "other"
+        summary.write_text(json.dumps(about))
+    with pytest.raises(InputError) as caught:
+        report(tmp_path)
+    assert caught.value.file is not None
+    assert caught.value.remedy
+
+
+def check_whole(out: Path) -> None:
+    for file in (p for p in out.rglob("*") if p.is_file() and not p.name.startswith(".")):
+        if file.suffix == ".json":
+            json.loads(file.read_text())
+        elif file.suffix == ".npz":
+            Estimate.load(file)
+        elif file.suffix == ".csv":
+            lines = file.read_text().splitlines()
+            assert len(lines) == 1 + 3 * 4
+            assert all(line.count(",") == 6 for line in lines)
+        else:
+            assert file.read_text().rstrip().endswith("</html>")
+
+
+def test_a_kill_at_any_time_leaves_whole_files(path, tmp_path, registry):
+    """Twenty kills over the time that one comparison takes, the last results lying there; then it goes on."""
+    quick = {name: replace(method, ran=None) for name, method in registry.items() if name != "filter-ct"}
+    compare_run(path, tmp_path, Config(), registry=quick)  # kernels are compiled
+    start = time.perf_counter()
+    compare_run(path, tmp_path, Config(seed=1), registry=quick)
+    duration = time.perf_counter() - start
+    context = multiprocessing.get_context("fork")
+    for k in range(20):
+        config = Config(seed=2 + k)
+        process = context.Process(target=compare_run, args=(path, tmp_path, config), kwargs={"registry": quick})
+        process.start()
+        process.join(duration * (k + 0.5) / 20)
+        process.kill()
+        process.join()
+        check_whole(tmp_path)
+    compare_run(path, tmp_path, Config(), registry=quick)
+    assert summary_of(tmp_path)["seed"] == 0
