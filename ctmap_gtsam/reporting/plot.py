@@ -138,21 +138,26 @@ def _panels_of_reference(comparison: Comparison, methods: Sequence[str]) -> list
 
 
 def _grid(comparison: Comparison, panels: Sequence[_Panel]) -> tuple[Figure, list[Axes]]:
-    columns = 2 if len(panels) > 1 else 1
+    columns = min(max(len(panels), 1), 2 if len(panels) <= 4 else 3)
     rows = max(1, -(-len(panels) // columns))
     with mpl.rc_context(STYLE):
-        figure = Figure(
-            figsize=(10.4, 2.5 * rows), layout=ConstrainedLayoutEngine(h_pad=0.08, hspace=0.04, wspace=0.03)
-        )
+        layout = ConstrainedLayoutEngine(h_pad=0.08, hspace=0.04, wspace=0.03)
+        figure = Figure(figsize=(10.4, (2.5 if columns < 3 else 2.1) * rows), layout=layout)
         axes = [figure.add_subplot(rows, columns, k + 1) for k in range(len(panels))]
+    time = _times(comparison)
     for ax, panel in zip(axes, panels, strict=True):
         ax.set_title(panel.title.replace("_", " "), loc="left", fontsize=10.5, fontweight="bold")
         ax.set_xlabel("seconds" if _one_visit(comparison) else "frame; dashed: a new visit")
-        ax.margins(x=0.01)
-        if not _one_visit(comparison):
-            for f in np.flatnonzero(np.diff(comparison.visit)):
-                ax.axvline(f + 0.5, color=QUIET, linestyle=(0, (4, 3)), linewidth=1)
+        margin = 0.015 * max(time[-1] - time[0], 1e-3)
+        ax.set_xlim(time[0] - margin, time[-1] + margin)
+        for f in [] if _one_visit(comparison) else np.flatnonzero(np.diff(comparison.visit)):
+            ax.axvline(f + 0.5, color=QUIET, linestyle=(0, (4, 3)), linewidth=1)
     return figure, axes
+
+
+def _times(comparison: Comparison) -> Array:
+    """(F,) what the horizontal axis shows: seconds, or frames where there are hours between visits."""
+    return comparison.time_s if _one_visit(comparison) else np.arange(len(comparison.visit), dtype=np.float64)
 
 
 def _one_visit(comparison: Comparison) -> bool:
@@ -160,7 +165,7 @@ def _one_visit(comparison: Comparison) -> bool:
 
 
 def _line(ax: Axes, comparison: Comparison, values: Array, method: str, methods: Sequence[str]) -> None:
-    time = comparison.time_s if _one_visit(comparison) else np.arange(len(values), dtype=np.float64)
+    time = _times(comparison)
     k = list(methods).index(method) if method in methods else len(_LINES) - 1
     # a gap between visits, and where nothing can be drawn
     broken = np.where(np.isfinite(values), values, np.nan)
@@ -172,7 +177,7 @@ def _line(ax: Axes, comparison: Comparison, values: Array, method: str, methods:
 
 def _draw_errors(ax: Axes, comparison: Comparison, panel: _Panel, methods: Sequence[str]) -> None:
     """Logarithmic; frames without an answer are marks in a strip above."""
-    time = comparison.time_s if _one_visit(comparison) else np.arange(len(comparison.visit), dtype=np.float64)
+    time = _times(comparison)
     finite = np.concatenate([v[np.isfinite(v)] for v in panel.errors.values()] or [np.zeros(0)])
     finite = finite[finite > 0]
     low, high = (finite.min(), finite.max()) if len(finite) else (1.0, 10.0)

@@ -165,7 +165,6 @@ def _facts(run: Run, seed: int) -> list[tuple[str, str]]:
 
 
 def _pictures(run: Run, outcomes: Mapping[str, Outcome], shown: Sequence[str], frames: Iterable[int]) -> list[Picture]:
-    start = run.frames[0].time_ns if run.frames else 0
     out = []
     for f in frames:
         frame = run.frames[f]
@@ -175,8 +174,9 @@ def _pictures(run: Run, outcomes: Mapping[str, Outcome], shown: Sequence[str], f
             assert estimate is not None
             image = plot.overlay(run, frame, estimate.at(frame.time_ns, frame.T_world_camera))
             images.append((name, "data:image/jpeg;base64," + base64.b64encode(plot.jpeg(image)).decode()))
-        visit = f"visit {frame.visit + 1}, " if len(run.visits) > 1 else ""
-        out.append(Picture(f"{visit}frame {f} of {len(run.frames)}, {(frame.time_ns - start) * 1e-9:.2f} s", images))
+        seconds = (frame.time_ns - run.visits[frame.visit].frames[0].time_ns) * 1e-9
+        visit = f", {seconds:.2f} s into visit {frame.visit + 1}" if len(run.visits) > 1 else f", {seconds:.2f} s"
+        out.append(Picture(f"Frame {f} of {len(run.frames)}{visit}", images))
     return out
 
 
