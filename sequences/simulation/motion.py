@@ -23,7 +23,7 @@ class MotionConfig:
 
     visits: int = option(2, "recordings of the place", low=1, high=4)
     gap_h: float = option(4.0, "hours from one visit to the next", low=0.05)
-    moves: int = option(1, "things taken to another surface between two visits", low=0)
+    moves: int = option(1, "things taken to another surface between two visits, as far as they fit", low=0)
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,24 @@ def arrange(place: Place, place_config: PlaceConfig, config: MotionConfig, seed:
     visits = [Arrangement(FIRST_VISIT_NS, stock_place(place, place_config, seed), ())]
     for k in range(1, config.visits):
         rng = generator(seed, "simulation.motion", keyframe=k)
-        before = visits[-1].things
-        movers = _choose_movers(before, config, rng)
-        things = {t.inst_id: t for t in before if t.inst_id not in movers}
-        for old in (t for t in before if t.inst_id in movers):
+        before = {t.inst_id: t for t in visits[-1].things}
+        things = dict(before)
+        for inst_id in _restless_first(visits[-1].things, config, rng):
+            if sum(things[i] is not before[i] for i in before) == config.moves:
+                break
+            old = before[inst_id]
+            others = tuple(t for t in things.values() if t is not old)
             area = place.spots[old.spot].T_world_area
-            others = tuple(things.values())
-            things[old.inst_id] = put(place, old.inst_id, old.shape, others, place_config, rng, avoid_area=area)
-        visits.append(Arrangement(FIRST_VISIT_NS + k * gap_ns, tuple(things[t.inst_id] for t in before), movers))
+            # what fits on no other surface stays
+            things[inst_id] = put(place, inst_id, old.shape, others, place_config, rng, avoid_area=area) or old
+        moved = tuple(i for i in before if things[i] is not before[i])
+        visits.append(Arrangement(FIRST_VISIT_NS + k * gap_ns, tuple(things.values()), moved))
     return tuple(visits)
 
 
-def _choose_movers(things: tuple[Placed, ...], config: MotionConfig, rng: np.random.Generator) -> tuple[int, ...]:
-    """inst_ids of things, drawn without replacement by their probability of not having stayed."""
+def _restless_first(things: tuple[Placed, ...], config: MotionConfig, rng: np.random.Generator) -> list[int]:
+    """inst_ids in random order, drawn without replacement by their probability of not having stayed."""
     persistence = np.array([t.shape.object_class.persistence_s for t in things])
     leave = 0.5 * (1.0 - np.exp(-config.gap_h * 3600.0 / persistence))
-    n = min(config.moves, len(things))
-    chosen = rng.choice(len(things), size=n, replace=False, p=leave / leave.sum())
-    return tuple(sorted(things[int(k)].inst_id for k in chosen))
+    order = rng.choice(len(things), size=len(things), replace=False, p=leave / leave.sum())
+    return [things[int(k)].inst_id for k in order]

@@ -153,12 +153,24 @@ def _spots(furniture: int, piece: Placed) -> list[Spot]:
 
 
 def stock_place(place: Place, config: PlaceConfig, seed: int) -> tuple[Placed, ...]:
-    """Put every thing somewhere: the large ones first, as people do; inst_ids from 1 in the order of `Place.stock`."""
+    """Put every thing somewhere: the large ones first, as people do; inst_ids from 1 in the order of `Place.stock`.
+
+    Raises:
+        InputError: the place is too full.
+    """
     things: dict[int, Placed] = {}
     for k in np.argsort([-s.object_class.diameter_m for s in place.stock], kind="stable"):
-        rng = generator(seed, "simulation.stock", int(k) + 1)
-        things[int(k)] = put(place, int(k) + 1, place.stock[k], tuple(things.values()), config, rng)
-    return tuple(things[k] for k in range(len(place.stock)))
+        shape, inst_id = place.stock[k], int(k) + 1
+        rng = generator(seed, "simulation.stock", inst_id)
+        placed = put(place, inst_id, shape, tuple(things.values()), config, rng)
+        if placed is None:
+            raise InputError(
+                f"found no free spot for {shape.object_class.name}, thing {inst_id} of {len(place.stock)}",
+                field="place.objects",
+                remedy="simulate fewer objects, or set a smaller place.clearance_m",
+            )
+        things[inst_id] = placed
+    return tuple(things[k + 1] for k in range(len(place.stock)))
 
 
 def put(
@@ -169,8 +181,8 @@ def put(
     config: PlaceConfig,
     rng: np.random.Generator,
     avoid_area: Array | None = None,
-) -> Placed:
-    """Stand a thing on a surface, in a stable rest with a random yaw, clear of the others.
+) -> Placed | None:
+    """Stand a thing on a surface, in a stable rest with a random yaw, clear of the others; None where nothing is free.
 
     Args:
         place: where.
@@ -180,9 +192,6 @@ def put(
         config: clearance and sense of order.
         rng: draws all of it.
         avoid_area: T_world_area (4, 4) of a surface it shall not stand on.
-
-    Raises:
-        InputError: no free spot was found; the place is too full.
     """
     for _ in range(TRIES):
         home = place.homes.get(shape.object_class.category, 0)
@@ -196,11 +205,7 @@ def put(
         T_area_object = _rest_on(shape, rotation("z", np.degrees(yaw)) @ rest, middle)
         if _fits(shape, T_area_object, spot, others, place, config):
             return Placed(inst_id, shape, spot.T_world_area @ T_area_object, k)
-    raise InputError(
-        f"found no free spot for {shape.object_class.name}, thing {inst_id} of {len(place.stock)}",
-        field="place.objects",
-        remedy="simulate fewer objects, or set a smaller place.clearance_m",
-    )
+    return None
 
 
 def _rest_on(shape: Shape, R: Array, middle: Array) -> Array:

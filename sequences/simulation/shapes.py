@@ -135,17 +135,18 @@ def milk_carton() -> Mesh:
 
 
 def banana() -> Mesh:
-    """A banana 190 mm along its bend, lying on its side."""
-    s = np.linspace(0.0, 1.0, 19)
+    """A banana 190 mm along its bend, lying on its side: a stem at -x, a tip at +x."""
+    s = np.linspace(0.0, 1.0, 21)
     angle = np.radians(-60.0 + 120.0 * s)
     path = 0.09 * np.stack([np.sin(angle), np.cos(angle), np.zeros_like(s)], axis=-1)
-    radius = 0.0185 * np.clip(4.6 * s * (1.0 - s), 0.0, 1.0) ** 0.6 + 0.0035 + 0.001 * np.cos(2 * np.pi * s)
+    girth = [0.0055, 0.005, 0.006, 0.0145, 0.0186, 0.019, 0.0186, 0.015, 0.008, 0.0035]
+    radius = np.interp(s, [0.0, 0.04, 0.1, 0.17, 0.27, 0.5, 0.74, 0.86, 0.95, 1.0], girth)
     yellow, green, brown = np.array((238, 200, 52)), np.array((170, 180, 60)), np.array((92, 64, 34))
 
     def paint(vertices: Array) -> Array:
         at = (np.degrees(np.arctan2(vertices[:, 0], vertices[:, 1])) + 60.0) / 120.0
-        colours = np.where((at < 0.16)[:, None], green, yellow)
-        return np.where(((at < 0.07) | (at > 0.96))[:, None], brown, colours)
+        colours = np.where((at < 0.18)[:, None], green, yellow)
+        return np.where(((at < 0.03) | (at > 0.97))[:, None], brown, colours)
 
     return assemble([(tube(path, radius, 20, flatten=0.92), paint)])
 

@@ -48,7 +48,7 @@ def camera_path(place: Place, config: TrajectoryConfig, seed: int, visit: int) -
     table, shelf = place.table.T_world_object[:3, 3], place.shelf.T_world_object[:3, 3]
     height = config.height_m + 0.02 * np.sin(2 * np.pi * 0.8 * s + rng.uniform(0, 2 * np.pi))
     eye = np.stack([table[0] + radius * np.sin(azimuth), table[1] - radius * np.cos(azimuth), height], axis=-1)
-    swing = 0.22 * np.sin(2 * np.pi * 1.5 * s + rng.uniform(0, 2 * np.pi))
+    swing = 0.15 * np.sin(2 * np.pi * 1.5 * s + rng.uniform(0, 2 * np.pi))
     on_table = np.stack([table[0] + swing, np.full_like(s, table[1]), np.full_like(s, 0.78)], axis=-1)
     on_shelf = np.array([shelf[0], shelf[1], 0.85])
     share = config.pan * np.sin(np.pi * s)[:, None] ** 2
