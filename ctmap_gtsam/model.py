@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
 from ctmap_gtsam.shapes import Shape, build_shapes
+from factors import prediction
 from factors.context import PairMixture, relation_table
 from factors.measurement import (
     DepthModel,
@@ -59,6 +60,16 @@ class Model:
     def log_confusion(self) -> Array:
         """(C, C) log pi(d | c): the class d that the detector persistently believes, for the true class c (columns d)."""
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
+
+    def prediction_covariance(self, dt_s: float) -> Array:
+        """Sigma = Q dt (6, 6) in the centre frame's tangent."""
+        p = self.config.prediction
+        return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
+
+    def log_uniform(self, shape: Shape) -> float:
+        """log density of a pose anywhere in the neighbourhood, over poses modulo the object's symmetries."""
+        radius = self.config.prediction.region_radius_m
+        return -(shape.symmetry.log_quotient_rotations + float(np.log(4.0 / 3.0 * np.pi * radius**3)))
 
     def view_share(self, before: Array, after: Array, dt_s: float) -> float:
         """How much of a view is news, 0 to 1: the share its evidence counts.

@@ -63,10 +63,10 @@ class Context:
     """Relations between objects."""
 
     relations: CategoryRelations = field(default_factory=CategoryRelations)
-    support_tolerance_m: float = option(0.005, "gaps and dents up to this are errors of the surface, metres", low=0.0)
-    support_sigma_m: float = option(0.015, "how far beyond that a thing may seem to float, metres", low=1e-4)
+    support_tolerance_m: float = option(0.008, "gaps and dents up to this are errors of the surface, metres", low=0.0)
+    support_sigma_m: float = option(0.01, "how far beyond that a thing may seem to float, metres", low=1e-4)
     other_support: float = option(0.02, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)
-    penetration_sigma_m: float = option(0.005, "how deep a thing may seem to sink into another, metres", low=1e-4)
+    penetration_sigma_m: float = option(0.003, "how deep a thing may seem to sink into another, metres", low=1e-4)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ class Smoother:
     """The factor graph and its rounds."""
 
     rounds: int = option(2, "re-weighting rounds after the first, at most", low=2)
-    searches: int = option(5, "keyframes of a track with a full search", low=1)
+    searches: int = option(5, "keyframes of a track with a search", low=1)
+    search_share: float = option(0.7, "effort of such a search, as a share of the configured one", low=0.01)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
     bias_rotation_rad: float = option(0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6)

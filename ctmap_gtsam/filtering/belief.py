@@ -120,8 +120,6 @@ class Updater:
         self.model = model
         self.proposer = proposer
         self.localisation = localisation
-        radius = model.config.prediction.region_radius_m
-        self._log_volume = float(np.log(4.0 / 3.0 * np.pi * radius**3))
 
     def start(self, track: Track, observation: Observation, around: Surroundings) -> Belief:
         """The belief of a track that has just become consistent: a full search for every class."""
@@ -193,7 +191,7 @@ class Updater:
             if own is None or log_evidence[c] < log_evidence.max() - 3.0 * _LIKELY:
                 weighted.append(None)
                 continue
-            nats = self._context(self.model.shapes[c], own.particles.T_world_centre, around)
+            nats = around.log_potential(self.model, self.model.shapes[c], own.particles.T_world_centre)
             joint = own.particles.log_weight + nats
             context[c] = float(log_sum(joint))
             weighted.append((own, mixture.normalised(joint)))
@@ -214,11 +212,6 @@ class Updater:
             "context": float(context[best]),
         }
         return Reported(probability, float(existence), belief.visible, tuple(modes), ledger)
-
-    def _context(self, shape: Shape, T: Array, around: Surroundings) -> Array:
-        if not self.model.context:
-            return np.zeros(len(T))
-        return np.asarray(sum(around.log_context(self.model, shape, T).values()))
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
@@ -319,7 +312,7 @@ class Updater:
     ) -> ClassBelief | None:
         """Draw from prediction and proposals, weigh by the model (see `particles`)."""
         proposals = modes[1]
-        log_uniform = -(shape.symmetry.log_quotient_rotations + self._log_volume)
+        log_uniform = self.model.log_uniform(shape)
         if proposals is None and own is None:
             return None
         jump = self.model.config.prediction.jump_probability
@@ -358,18 +351,10 @@ class Updater:
         """What this keyframe says for something that no mesh explains, where the best hypothesis stands, nats."""
         best = int(np.argmax(belief.class_log_evidence(self.model)))
         own = belief.classes[best]
-        rate = self.model.config.detector.clutter_rate
         if own is None:
             return 0.0
-        T = observation.frame.T_camera_world @ own.particles.best(1)
-        _, scores = self.proposer.score(self.model.shapes[best], view, T)
-        gain = self.model.kappa * self.model.config.sensor.clutter_gain * float(scores.visible[0])
-        if view.detection is None:
-            return view.share * float(np.log1p(-rate))
-        # the box of clutter is as good as the best box of an object
-        box = np.array(view.detection.box)
-        matched = float(self.model.box(box, box[None], view.image_size)[0])
-        return view.share * (gain + float(np.log(rate)) + matched)
+        T = observation.frame.T_camera_world @ own.particles.best(1)[0]
+        return self.proposer.log_clutter(self.model.shapes[best], view, T)
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(

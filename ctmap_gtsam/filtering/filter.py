@@ -19,8 +19,9 @@ from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
 from ctmap_gtsam.frontend.association import Associator
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
+from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
-from ctmap_gtsam.frontend.surroundings import Gravity, Neighbour, Surroundings
+from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
 from sequences.progress import SILENT, Progress
 from sequences.types import LocalisationNoise, Run
@@ -64,7 +65,7 @@ class _State:
         self.model = model
         self.proposer = proposer
         self.associator = Associator(model.config.frontend)
-        self.gravity = Gravity.of(run)
+        self.place = Place(run)
         self.updater = Updater(model, proposer, run.localisation)
         self.beliefs: dict[int, Belief] = {}
         self.reports: list[dict[int, Reported]] = []
@@ -72,10 +73,10 @@ class _State:
     def step(self, observation: Observation) -> None:
         """Algorithm 1 for every object: neighbours are those of the keyframe before, so the order of objects is nothing."""
         self.associator.step(observation)
-        self.gravity.update(observation)
+        self.place.update(observation)
         before = self.reports[-1] if self.reports else {}
         reported: dict[int, Reported] = {}
-        surroundings = self._surroundings(observation, before)
+        surroundings = self._surroundings(before)
         known = [track for track in self.associator.tracks() if track.track_id in self.beliefs]
         for track in known:
             i, around = track.track_id, surroundings.without(track.track_id)
@@ -93,7 +94,7 @@ class _State:
         started: dict[int, Belief] = {}
         reported: dict[int, Reported] = {}
         for _ in range(2 if len(new) > 1 else 1):
-            surroundings = self._surroundings(observation, {**before, **reported})
+            surroundings = self._surroundings({**before, **reported})
             for track in new:
                 around = surroundings.without(track.track_id)
                 started[track.track_id] = self.updater.start(track, observation, around)
@@ -103,8 +104,8 @@ class _State:
         self.beliefs |= started
         return reported
 
-    def _surroundings(self, observation: Observation, reports: Mapping[int, Reported]) -> Surroundings:
-        return Surroundings.of(observation, self.gravity, self._neighbours(reports))
+    def _surroundings(self, reports: Mapping[int, Reported]) -> Surroundings:
+        return Surroundings(self._neighbours(reports), self.place.surfaces)
 
     def _neighbours(self, reports: Mapping[int, Reported]) -> tuple[Neighbour, ...]:
         """Objects that are sure of themselves, by their most likely particle."""
@@ -136,7 +137,7 @@ def _estimate(run: Run, model: Model, keyframes: NDArray[np.int64], state: _Stat
         np.tile(localisation_covariance(run.localisation), (len(frames), 1, 1)),
         {
             "diagnostics": {"hypotheses_scored": state.proposer.hypotheses_scored},
-            "up_world": None if state.gravity.up_world is None else state.gravity.up_world.tolist(),
+            **describe(state.place),
         },
     )
 

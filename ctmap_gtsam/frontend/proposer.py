@@ -138,6 +138,20 @@ class Proposer:
         covariance, free = self._shape_of_score(shape, view, poses, scores.log_ratio[keep], probe)
         return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance, free)
 
+    def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
+        """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
+
+        A surface of unknown form explains a share of what the right mesh would; its boxes come less often, and fit as well.
+        """
+        detector, sensor = self.model.config.detector, self.model.config.sensor
+        _, scores = self.score(shape, view, T_camera_centre[None])
+        gain = self.model.kappa * sensor.clutter_gain * float(scores.visible[0])
+        if view.detection is None:
+            return view.share * float(np.log1p(-detector.clutter_rate))
+        box = np.array(view.detection.box)
+        matched = float(self.model.box(box, box[None], view.image_size)[0])
+        return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
+
     def _draw(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int) -> Array | None:
         """The paper's first particles: (n, 4, 4)."""
         assert view.detection is not None

@@ -1,13 +1,12 @@
-"""What stands around an object when it is weighed: its neighbours' best poses, the level surfaces, which way is up."""
+"""What stands around an object when it is weighed: its neighbours' best poses and the level surfaces."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.frontend.observation import Observation
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -15,11 +14,9 @@ from factors.context import context_log_ratio, hinge_log_potential
 from sequences import se3
 from sequences.geometry import Plane
 from sequences.rendering.scene import render_scene
-from sequences.types import Run
 
 Array = NDArray[np.float64]
 
-_LEVEL_RAD = 0.35  # planes steeper than this carry nothing
 _CONTACTS = 48  # surface points of a neighbour that are tested for penetration
 
 
@@ -33,40 +30,13 @@ class Neighbour:
     """(4, 4)"""
 
 
-@dataclass
-class Gravity:
-    """Which way is up, as far as has been seen: given by the run, or the mean of what the planes say."""
-
-    up_world: Array | None
-    given: bool
-    _sum: Array = field(default_factory=lambda: np.zeros(3))
-
-    @classmethod
-    def of(cls, run: Run) -> Gravity:
-        """From the run's own statement, if it has one."""
-        return cls(run.up_world, run.up_world is not None)
-
-    def update(self, observation: Observation) -> None:
-        """Take in one keyframe."""
-        up = observation.up_camera
-        if self.given or up is None:
-            return
-        self._sum = self._sum + observation.frame.T_world_camera[:3, :3] @ up
-        self.up_world = self._sum / np.linalg.norm(self._sum)
-
-
 @dataclass(frozen=True)
 class Surroundings:
     """At one keyframe, in the world frame."""
 
     neighbours: tuple[Neighbour, ...]
     supports: tuple[Plane, ...]
-    """level planes in view, world frame; empty where up is unknown"""
-
-    @classmethod
-    def of(cls, observation: Observation, gravity: Gravity, neighbours: tuple[Neighbour, ...]) -> Surroundings:
-        """The level planes of a keyframe, and who is there."""
-        return cls(neighbours, level_planes(observation, gravity.up_world))
+    """level surfaces, world frame; empty where up is unknown"""
 
     def without(self, object_id: int) -> Surroundings:
         """The same for one object: it is not its own neighbour."""
@@ -81,12 +51,12 @@ class Surroundings:
         nearer = (there > 0) & ((tile.background == 0) | (there < tile.background))
         return replace(tile, background=np.where(nearer, there, tile.background))
 
-    def log_context(self, model: Model, shape: Shape, T_world_centre: Array) -> dict[str, Array]:
-        """The context potential of poses (K, 4, 4) by kind, nats (K,) each: once for a stationary episode."""
-        return {
-            "context": self._category(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre),
-            "support": support_log_potential(model, shape, T_world_centre, self.supports),
-        }
+    def log_potential(self, model: Model, shape: Shape, T_world_centre: Array) -> Array:
+        """The context potential of poses (K, 4, 4), nats (K,): once for a stationary episode. 0 without context."""
+        if not model.context or not len(T_world_centre):
+            return np.zeros(len(T_world_centre))
+        together = self._category(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre)
+        return together + support_log_potential(model, shape, T_world_centre, self.supports)
 
     def _category(self, model: Model, shape: Shape, T: Array) -> Array:
         total = np.zeros(len(T))
@@ -119,28 +89,19 @@ def penetration_depth(shape: Shape, points: Array) -> Array:
 
 
 def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:
-    """How well poses (K, 4, 4) stand on the level surfaces, nats (K,); 0 where none is known.
+    """How well poses (K, 4, 4) stand on the level surface that suits them best, nats (K,); 0 where none is below.
 
-    Floating over the nearest surface below is a hinge with a floor: a thing may rest on something that was not seen.
-    Sinking into one has no floor: surfaces are solid. A thing wholly beneath a surface has nothing to do with it.
+    Floating is a hinge with a floor: a thing may rest on something that was not seen. Sinking has no floor: surfaces are
+    solid. A thing wholly beneath a surface has nothing to do with it.
     """
     settings = model.config.context
-    gap = np.full(len(T_world_centre), np.inf)
-    sunk = np.zeros(len(T_world_centre))
+    best = np.full(len(T_world_centre), -np.inf)
     for plane in supports:
         heights = se3.transform(T_world_centre, shape.hull_points) @ plane.normal - plane.offset
         low, high = heights.min(axis=-1), heights.max(axis=-1)
+        floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
+        sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
+        potential = np.logaddexp(floating, np.log(settings.other_support)) + sinking
         concerned = plane.contains(T_world_centre[:, :3, 3]) & (high > 0.0)
-        gap = np.where(concerned, np.minimum(gap, np.maximum(low, 0.0)), gap)
-        sunk = np.where(concerned, np.maximum(sunk, -low), sunk)
-    floating = hinge_log_potential(gap - settings.support_tolerance_m, settings.support_sigma_m)
-    resting = np.where(np.isinf(gap), 0.0, np.logaddexp(floating, np.log(settings.other_support)))
-    return resting + hinge_log_potential(sunk - settings.support_tolerance_m, settings.penetration_sigma_m)
-
-
-def level_planes(observation: Observation, up_world: Array | None) -> tuple[Plane, ...]:
-    """The planes of a keyframe that things can rest on, world frame."""
-    if up_world is None:
-        return ()
-    planes = (plane.moved(observation.frame.T_world_camera) for plane in observation.planes)
-    return tuple(p for p in planes if p.normal @ up_world > np.cos(_LEVEL_RAD))
+        best = np.where(concerned, np.maximum(best, potential), best)
+    return np.where(np.isneginf(best), 0.0, best)

@@ -1,0 +1,1 @@
+"""The factor graph: every frame sees the whole run."""

@@ -1,0 +1,245 @@
+"""What the trellises of all classes say of one object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.smoothing.discrete import Posterior, Stage, solve
+from ctmap_gtsam.smoothing.graph import Measured
+from ctmap_gtsam.smoothing.modes import Recording, Sighting, in_world
+from factors import mixture
+from factors.mixture import log_sum
+
+Array = NDArray[np.float64]
+
+_POSSIBLE = 40.0  # nats behind the best class beyond which a class is given up
+_LIKELY = 10.0  # nats behind the best class within which its modes are probed with care
+_STAYED = 0.5
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One object: its tracks, sightings, and the trellis of every class."""
+
+    object_id: int
+    tracks: tuple[Track, ...]
+    sightings: Mapping[int, Sighting]
+    """by keyframe"""
+    stages: Mapping[int, tuple[Stage, ...]]
+    """class index -> states at the keyframes in view"""
+    posteriors: Mapping[int, Posterior]
+    """class index -> what its trellis says"""
+    class_log_evidence: Array
+    """(C,) depth, boxes, context, scores and prior"""
+    log_clutter: float
+    """log evidence of something that no mesh explains, at the same keyframes"""
+    poses: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
+    """keyframe -> smoothed T_world_centre (4, 4) and covariance (6, 6) of the best class"""
+
+    @cached_property
+    def class_probability(self) -> Array:
+        """(C,)"""
+        return np.exp(mixture.normalised(self.class_log_evidence))
+
+    @property
+    def best_class(self) -> int:
+        """Index in the catalogue."""
+        return int(np.argmax(self.class_log_evidence))
+
+    @property
+    def log_evidence(self) -> float:
+        """Of all classes together, against nothing."""
+        return float(log_sum(self.class_log_evidence))
+
+    @cached_property
+    def solid(self) -> float:
+        """P(a known mesh rather than clutter or nothing)."""
+        odds = self.log_evidence - float(np.logaddexp(self.log_clutter, 0.0))
+        return float(1.0 / (1.0 + np.exp(-np.clip(odds, -700.0, 700.0))))
+
+    @property
+    def exists(self) -> bool:
+        """Whether it is more likely a thing than not."""
+        return self.solid > 0.5 and self.best_class in self.posteriors
+
+    @cached_property
+    def keyframes(self) -> tuple[int, ...]:
+        """In view, ascending: those of every stage."""
+        return tuple(sorted(self.sightings))
+
+    @cached_property
+    def presence(self) -> Array:
+        """P(present | it exists) at each of `keyframes`, for the best class."""
+        posterior = self.posteriors.get(self.best_class)
+        if posterior is None:
+            return np.zeros(len(self.keyframes))
+        return np.array([1.0 - m[-1] for m in posterior.modes])
+
+    @property
+    def anchor(self) -> Array | None:
+        """A smoothed pose (4, 4) in the middle of its life; None where it has none."""
+        if not self.poses:
+            return None
+        keyframes = sorted(self.poses)
+        return self.poses[keyframes[len(keyframes) // 2]][0]
+
+    def possible(self, model: Model) -> list[int]:
+        """Classes worth another round."""
+        floor = self.class_log_evidence.max() - _POSSIBLE
+        return [c for c in range(len(model.shapes)) if self.class_log_evidence[c] >= floor]
+
+    def likely(self) -> list[int]:
+        """Classes whose covariances matter."""
+        floor = self.class_log_evidence.max() - _LIKELY
+        return [int(c) for c in np.flatnonzero(self.class_log_evidence >= floor)]
+
+    def pose_near(self, c: int, keyframe: int) -> Array | None:
+        """(1, 4, 4) best guess of class c at a keyframe: smoothed, or the trellis's nearest mode."""
+        if c == self.best_class and self.poses:
+            return self.poses[_nearest(sorted(self.poses), keyframe)][0][None]
+        stages = self.stages.get(c)
+        if stages is None:
+            return None
+        path = self.posteriors[c].path
+        there = [i for i, s in enumerate(stages) if path[i] < len(s.log_evidence)]
+        if not there:
+            return None
+        i = min(there, key=lambda i: (abs(stages[i].keyframe - keyframe), i))
+        return stages[i].T_world_centre[path[i]][None]
+
+    def presence_at(self, keyframe: int) -> float:
+        """P(present | it exists) at any keyframe: that of the last one in view, or of the first before that."""
+        if not self.keyframes:
+            return 0.0
+        i = max(int(np.searchsorted(self.keyframes, keyframe, side="right")) - 1, 0)
+        return float(self.presence[i])
+
+    def present_pose(self, keyframe: int) -> Array | None:
+        """(4, 4) where it surely is at a keyframe; None where that isn't sure, or its class isn't."""
+        sure = self.exists and self.class_probability[self.best_class] > 0.8 and self.presence_at(keyframe) > 0.5
+        pose = self.pose_near(self.best_class, keyframe) if sure else None
+        return None if pose is None else pose[0]
+
+    def measured(self, recording: Recording) -> list[Measured]:
+        """The modes that the best path goes through."""
+        c = self.best_class
+        out: list[Measured] = []
+        stayed = True
+        for i, (stage, state) in enumerate(zip(self.stages[c], self.posteriors[c].path, strict=True)):
+            if i:
+                stayed = stayed and self.posteriors[c].moved[i - 1] < _STAYED
+            if state == len(stage.log_evidence):
+                stayed = False
+                continue
+            modes = self.sightings[stage.keyframe].modes[c]
+            assert modes is not None
+            out.append(
+                Measured(
+                    stage.keyframe,
+                    stage.time_s,
+                    recording.run.frames[int(recording.keyframes[stage.keyframe])].visit,
+                    modes.T_camera_centre[state],
+                    modes.covariance[state],
+                    stays=stayed and bool(out),
+                )
+            )
+            stayed = True
+        return out
+
+    def held(self, keyframe: int) -> tuple[Array, Array] | None:
+        """Smoothed pose and covariance at the nearest measured keyframe, the past first; None where it has none."""
+        if not self.poses:
+            return None
+        keyframes = sorted(self.poses)
+        before = [k for k in keyframes if k <= keyframe]
+        return self.poses[before[-1] if before else keyframes[0]]
+
+    def chosen_log_weight(self, keyframe: int) -> float:
+        """log share of the chosen mode among those of its class at a keyframe; 0 where nothing else is in question."""
+        if keyframe not in self.sightings:
+            return 0.0
+        i = self.keyframes.index(keyframe)
+        posterior = self.posteriors[self.best_class]
+        marginal, state = posterior.modes[i], posterior.path[i]
+        if state == len(marginal) - 1:
+            return 0.0
+        return float(np.log(max(marginal[state] / max(1.0 - marginal[-1], 1e-300), 1e-300)))
+
+    def with_poses(self, poses: Mapping[int, tuple[Array, Array]]) -> Thing:
+        """The same with smoothed poses."""
+        return replace(self, poses=dict(poses))
+
+
+def _nearest(sorted_keyframes: list[int], keyframe: int) -> int:
+    return min(sorted_keyframes, key=lambda k: (abs(k - keyframe), k))
+
+
+def judge(
+    object_id: int,
+    tracks: tuple[Track, ...],
+    sightings: Mapping[int, Sighting],
+    recording: Recording,
+    model: Model,
+) -> Thing:
+    """Solve the trellis of every class that has modes, and weigh the classes."""
+    keyframes = sorted(sightings)
+    stages: dict[int, tuple[Stage, ...]] = {}
+    posteriors: dict[int, Posterior] = {}
+    evidence = np.full(len(model.shapes), -np.inf)
+    for shape in model.shapes:
+        c = shape.index
+        if not any(s.modes[c] is not None and len(s.modes[c]) for s in sightings.values()):  # type: ignore[arg-type]
+            continue
+        stages[c] = tuple(_stage(sightings[k], c, len(keyframes), recording) for k in keyframes)
+        posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], recording, model))
+        evidence[c] = posteriors[c].log_evidence
+    scores = _score_evidence(tracks, recording, model)
+    clutter = float(sum(s.log_clutter for s in sightings.values()))
+    return Thing(
+        object_id,
+        tracks,
+        sightings,
+        stages,
+        posteriors,
+        evidence + scores - np.log(len(model.shapes)),
+        clutter,
+    )
+
+
+def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:
+    """(6,) how far two views of a still object differ, for localisation's error and the depth's bias."""
+    noise, bias = recording.run.localisation, model.config.smoother
+    seen = [s for s in stages if len(s.log_evidence)]
+    cameras = np.stack([recording.T_world_camera(s.keyframe)[:3, 3] for s in seen])
+    away = float(np.median(np.linalg.norm(cameras - np.stack([s.T_world_centre[0, :3, 3] for s in seen]), axis=-1)))
+    turned = noise.rotation_rad**2 + bias.bias_rotation_rad**2
+    moved = noise.translation_m**2 + (away * noise.rotation_rad) ** 2 + bias.bias_translation_m**2
+    return np.repeat([turned, moved], 3)
+
+
+def _stage(sighting: Sighting, c: int, n_keyframes: int, recording: Recording) -> Stage:
+    modes = sighting.modes[c]
+    T = in_world(sighting, c, recording.T_world_camera(sighting.keyframe))
+    if modes is None:
+        empty = np.zeros(0)
+        return Stage(sighting.keyframe, recording.time_s(sighting.keyframe), T, np.zeros((0, 6, 6)), empty)
+    # one fact for as long as the object stands still: a share of it a keyframe
+    nats = modes.log_likelihood + sighting.context[c] / n_keyframes
+    return Stage(sighting.keyframe, recording.time_s(sighting.keyframe), T, modes.covariance, nats)
+
+
+def _score_evidence(tracks: tuple[Track, ...], recording: Recording, model: Model) -> Array:
+    """(C,) what the detector's score vectors say, a persistent belief a visit."""
+    by_visit: dict[int, Array] = {}
+    for track in tracks:
+        for k, detection in zip(track.keyframes, track.detections, strict=True):
+            visit = recording.run.frames[int(recording.keyframes[k])].visit
+            by_visit[visit] = by_visit.get(visit, np.zeros(len(model.shapes))) + model.class_scores(detection)
+    return np.asarray(sum((model.class_evidence(s) for s in by_visit.values()), np.zeros(len(model.shapes))))

@@ -1,0 +1,65 @@
+"""Which tracks are one object: what left one place and what came to another may be the same thing, moved.
+
+An object that is gone from some keyframe on and one of the same class that was not there before are joined by a global
+assignment of what vanished to what appeared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.smoothing.belief import Thing, judge
+from ctmap_gtsam.smoothing.modes import Recording
+
+_SAME_CLASS = 0.5  # least P(both are of one class) for a join
+
+
+def join_moved(things: Mapping[int, Thing], recording: Recording, model: Model) -> dict[int, Thing]:
+    """Join each object that vanished with the one that it reappeared as; the rest stays as it is."""
+    joined = dict(things)
+    vanished = [t for t in things.values() if t.exists and (last := _last_present(t)) is not None and last < t.keyframes[-1]]
+    appeared = [t for t in things.values() if t.exists and _first_present(t) is not None]
+    if not vanished or not appeared:
+        return joined
+    score = np.array([[_match(a, b) for b in appeared] for a in vanished])
+    for row, column in zip(*linear_sum_assignment(-score), strict=True):
+        a, b = vanished[row], appeared[column]
+        if score[row, column] < _SAME_CLASS or a.object_id not in joined or b.object_id not in joined:
+            continue
+        joined[a.object_id] = _joined(a, b, recording, model)
+        del joined[b.object_id]
+    return joined
+
+
+def _match(a: Thing, b: Thing) -> float:
+    """P(a and b are of one class) where b begins after a has ended, else 0."""
+    if a.object_id == b.object_id:
+        return 0.0
+    ended, begun = _last_present(a), _first_present(b)
+    if ended is None or begun is None or begun <= ended:
+        return 0.0
+    return float(a.class_probability @ b.class_probability)
+
+
+def _last_present(thing: Thing) -> int | None:
+    there = [k for k, p in zip(thing.keyframes, thing.presence, strict=True) if p > 0.5]
+    return there[-1] if there else None
+
+
+def _first_present(thing: Thing) -> int | None:
+    there = [k for k, p in zip(thing.keyframes, thing.presence, strict=True) if p > 0.5]
+    return there[0] if there else None
+
+
+def _joined(a: Thing, b: Thing, recording: Recording, model: Model) -> Thing:
+    """One object: seen as a until it vanished, as b from there on."""
+    begun = _first_present(b)
+    assert begun is not None
+    sightings = {k: s for k, s in a.sightings.items() if k < begun} | {
+        k: s for k, s in b.sightings.items() if k >= begun
+    }
+    return judge(a.object_id, (*a.tracks, *b.tracks), sightings, recording, model)

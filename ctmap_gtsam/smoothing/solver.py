@@ -1,0 +1,83 @@
+"""Levenberg-Marquardt over GTSAM's linearisation and elimination.
+
+GTSAM's own optimisers copy all of Values for every call of a Python factor; `graph.linearize(values)` on Values that
+Python owns does not. So the loop is ours, and linearisation, elimination and marginals are GTSAM's. Levenberg's
+damping (1944) in a unit in which a radian weighs as much as `LEVER_M` metres; undamped while that works.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gtsam
+import numpy as np
+
+LEVER_M = 0.1
+"""how far from an object's centre its surface is, more or less: what a turn of a radian moves"""
+
+_FIRST, _GROWTH, _LAST = 1e-2, 100.0, 1e14
+
+End = Literal["converged", "stalled", "cap"]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the loop ended, and how."""
+
+    values: Any
+    """gtsam.Values"""
+    energy: float
+    """graph.error at the values"""
+    end: End
+    """converged: the energy fell by less than the tolerance; stalled: no damping kept it from rising; cap: out of iterations"""
+    trace: tuple[float, ...]
+    """energy at the start and after every accepted step"""
+
+
+def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) -> Solution:
+    """Minimise graph.error from `values`.
+
+    Args:
+        graph: gtsam.NonlinearFactorGraph over poses and 6-vectors.
+        values: gtsam.Values, not changed.
+        max_iterations: accepted steps at most.
+        tolerance: relative fall of the energy at which it is converged.
+    """
+    energy = graph.error(values)
+    trace = [energy]
+    damping = 0.0
+    for _ in range(max_iterations):
+        linear = graph.linearize(values)
+        moved = None
+        while damping < _LAST:
+            moved = _step(linear, values, damping)
+            after = np.inf if moved is None else graph.error(moved)
+            if np.isfinite(after) and after <= energy:
+                break
+            moved = None
+            damping = max(damping * _GROWTH, _FIRST)
+        if moved is None:
+            return Solution(values, energy, "stalled", tuple(trace))
+        fell = energy - after
+        values, energy = moved, after
+        trace.append(energy)
+        damping = 0.0 if damping <= _FIRST else damping / _GROWTH
+        if fell <= tolerance * max(energy, 1.0):
+            return Solution(values, energy, "converged", tuple(trace))
+    return Solution(values, energy, "cap", tuple(trace))
+
+
+def _step(linear: Any, values: Any, damping: float) -> Any:
+    """Values after the damped step, None where the system is singular."""
+    damped = linear
+    if damping > 0.0:
+        damped = gtsam.GaussianFactorGraph()
+        damped.push_back(linear)
+        for key in values.keys():  # noqa: SIM118 (gtsam.Values isn't a mapping)
+            scale = np.sqrt(damping) * np.repeat([1.0, 1.0 / LEVER_M], 3)
+            damped.add(key, np.diag(scale), np.zeros(6), gtsam.noiseModel.Unit.Create(6))
+    try:
+        return values.retract(damped.optimize())
+    except RuntimeError:
+        return None
