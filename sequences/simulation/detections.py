@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sequences.catalogue import Catalogue, ObjectClass
-from sequences.options import option
 from sequences.seeds import generator
+from sequences.simulation.config import DetectorConfig
 from sequences.types import Detection
 
 Array = NDArray[np.float64]
@@ -31,14 +31,6 @@ STRETCH = 8.0  # ... for so many images on end, on average
 CERTAINTY = 5.0  # lead of the believed class in log odds at noise 1, right or wrong: overconfident
 SURE = 12.0  # the same at noise 0
 RESEMBLANCE = 6.0  # how strongly confusion prefers classes of like size
-
-
-@dataclass(frozen=True)
-class DetectorConfig:
-    """The detector."""
-
-    noise: float = option(1.0, "scales every imperfection; 0 is a perfect detector", low=0.0, high=4.0)
-    furniture: bool = option(True, "whether tables and shelves are detected too")
 
 
 @dataclass(frozen=True)

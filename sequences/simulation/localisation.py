@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sequences import se3
-from sequences.options import option
 from sequences.types import LocalisationNoise
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class LocalisationConfig:
-    """Error of the recorded camera poses; the run states it."""
-
-    rotation_rad: float = option(0.003, "standard deviation about each axis, rad", low=0.0)
-    translation_m: float = option(0.005, "standard deviation along each axis, metres", low=0.0)
-    correlation_time_s: float = option(10.0, "how long an error lasts, seconds", low=0.001)
-
-    @property
-    def noise(self) -> LocalisationNoise:
-        """As a run states it."""
-        return LocalisationNoise(self.rotation_rad, self.translation_m, self.correlation_time_s)
 
 
 def recorded_poses(

@@ -10,20 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sequences.options import option
 from sequences.seeds import generator
-from sequences.simulation.place import Place, PlaceConfig, Placed, put, stock_place
+from sequences.simulation.config import MotionConfig, PlaceConfig
+from sequences.simulation.place import Place, Placed, put, stock_place
 
 FIRST_VISIT_NS = 1_538_384_400_000_000_000  # 2018-10-01 09:00 UTC
-
-
-@dataclass(frozen=True)
-class MotionConfig:
-    """The visits and what changes between them."""
-
-    visits: int = option(2, "recordings of the place", low=1, high=4)
-    gap_h: float = option(4.0, "hours from one visit to the next", low=0.05)
-    moves: int = option(1, "things taken to another surface between two visits, as far as they fit", low=0)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from scipy.spatial import ConvexHull
 from sequences import se3
 from sequences.catalogue import Mesh
 from sequences.errors import InputError
-from sequences.options import option
 from sequences.seeds import generator
+from sequences.simulation.config import PlaceConfig
 from sequences.simulation.room import room_mesh
 from sequences.simulation.shapes import SHELF, TABLE, Shape, household
 from sequences.simulation.solids import rotation
@@ -29,16 +29,6 @@ Array = NDArray[np.float64]
 WALL_GAP_M = 0.02  # between furniture and its wall
 TRIES = 400
 FRONT_YAW_RAD = 0.45  # on a shelf things face the room, more or less
-
-
-@dataclass(frozen=True)
-class PlaceConfig:
-    """What is in the place."""
-
-    objects: int = option(10, "small things in the place; classes repeat once all have been used", low=1, high=40)
-    distractors: int = option(2, "classes in the catalogue of which the place has none", low=0)
-    together: float = option(0.75, "probability that a thing stands where its category has its spot", low=0.0, high=1.0)
-    clearance_m: float = option(0.012, "least gap between the outlines of two things on one surface, metres", low=0.0)
 
 
 @dataclass(frozen=True)

@@ -17,46 +17,19 @@ sensor read at fewer pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from sequences.camera import Camera
-from sequences.options import option
+from sequences.simulation.config import FOCAL_PX, SENSOR_WIDTH, SensorConfig
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-SENSOR_WIDTH = 640
-FOCAL_PX = 570.3422  # of the PrimeSense Carmine and Asus Xtion as OpenNI states it
 BASELINE_M = 0.075
 RANGE_M = (0.35, 4.5)
 GRAZING_RAD = 1.2  # from this angle of incidence on, less and less light comes back
 EDGE_STEP = 0.02  # neighbours whose depths differ by this share are an edge
-
-
-@dataclass(frozen=True)
-class SensorConfig:
-    """The camera."""
-
-    width: int = option(640, "of the images, pixels; the height is three quarters of it", low=80, high=1280)
-    antialias: int = option(2, "each pixel's colour is the mean of so many samples each way", low=1, high=4)
-    depth_noise: float = option(1.0, "scales all noise and holes of depth; 0 is exact depth", low=0.0, high=10.0)
-    disparity_sigma_px: float = option(0.07, "noise of disparity, pixels: 1.6 mm at 1 m, 6.5 mm at 2 m", low=0.0)
-    correlation_px: float = option(0.8, "over how many pixels noise is alike", low=0.0)
-    lateral_sigma_px: float = option(0.5, "how far to the side depth is taken from, pixels", low=0.0)
-    quantisation_px: float = option(0.125, "step of disparity, pixels", low=0.0)
-    object_bias_m: float = option(0.001, "sigma of each thing's own depth error in a visit, metres", low=0.0)
-    colour_sigma: float = option(2.0, "noise of colour, of 255", low=0.0)
-
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics: the sensor's, scaled to the images' width."""
-        scale, height = self.width / SENSOR_WIDTH, self.width * 3 // 4
-        focal = FOCAL_PX * scale
-        return Camera(focal, focal, (self.width - 1) / 2.0, (height - 1) / 2.0, self.width, height)
 
 
 def measure_depth(exact: Depth, cosine: Array, bias: Array, config: SensorConfig, rng: np.random.Generator) -> Depth:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +15,15 @@ from sequences.catalogue import Mesh
 from sequences.progress import SILENT, Progress, Stage
 from sequences.rendering.scene import SceneImages, render_scene
 from sequences.seeds import generator
-from sequences.simulation.detections import Detector, DetectorConfig, Visible
+from sequences.simulation.config import SensorConfig, SimulationConfig
+from sequences.simulation.detections import Detector, Visible
 from sequences.simulation.lighting import LitScene, light, photograph
-from sequences.simulation.localisation import LocalisationConfig, recorded_poses
-from sequences.simulation.motion import Arrangement, MotionConfig, arrange
-from sequences.simulation.place import Place, PlaceConfig, Placed, furnish
-from sequences.simulation.sensor import SensorConfig, measure_colour, measure_depth
+from sequences.simulation.localisation import recorded_poses
+from sequences.simulation.motion import Arrangement, arrange
+from sequences.simulation.place import Place, Placed, furnish
+from sequences.simulation.sensor import measure_colour, measure_depth
 from sequences.simulation.shapes import catalogue
-from sequences.simulation.trajectory import TrajectoryConfig, camera_path
+from sequences.simulation.trajectory import camera_path
 from sequences.writing import FrameTruth, RunWriter, Sighting, VisitWriter
 
 Array = NDArray[np.float64]
@@ -33,18 +33,6 @@ UP = np.array([0.0, 0.0, 1.0])
 LAMP_M = (1.5, -1.3, 2.45)
 SILHOUETTE_PX = 160  # a silhouette is counted on a grid of at most so many samples each way
 NEAREST_M = 0.05  # vertices nearer than this say nothing of where a silhouette lies
-
-
-@dataclass(frozen=True)
-class SimulationConfig:
-    """A simulated run: a corner of a room with a table, a shelf and small things, visited a few times."""
-
-    place: PlaceConfig = field(default_factory=PlaceConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    trajectory: TrajectoryConfig = field(default_factory=TrajectoryConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
 
 
 def simulate_place(out: Path, config: SimulationConfig, seed: int, progress: Progress = SILENT) -> None:

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sequences import se3
-from sequences.options import option
 from sequences.seeds import generator
+from sequences.simulation.config import TrajectoryConfig
 from sequences.simulation.place import Place
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TrajectoryConfig:
-    """The camera's path in each visit."""
-
-    frames: int = option(26, "images of each visit", low=1)
-    period_s: float = option(0.5, "seconds between two images", low=0.001)
-    height_m: float = option(1.2, "of the camera above the floor, a head's; metres", low=0.9, high=1.6)
-    radius_m: float = option(1.1, "of the arc about the table's middle, metres", low=0.8, high=2.0)
-    arc_deg: float = option(55.0, "the arc's length, degrees", low=0.0, high=80.0)
-    pan: float = option(1.0, "how far the head turns from the table to the shelf", low=0.0, high=1.0)
 
 
 def camera_path(place: Place, config: TrajectoryConfig, seed: int, visit: int) -> tuple[NDArray[np.int64], Array]:

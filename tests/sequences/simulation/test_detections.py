@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sequences.simulation import DetectorConfig
 from sequences.simulation.detections import (
     CONFUSED,
     FALSE_POSITIVES,
@@ -12,7 +13,6 @@ from sequences.simulation.detections import (
     MISSED,
     STRETCH,
     Detector,
-    DetectorConfig,
     Visible,
     detection_probability,
 )

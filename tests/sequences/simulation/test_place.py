@@ -6,8 +6,9 @@ import pytest
 
 from sequences import se3
 from sequences.errors import InputError
-from sequences.simulation.motion import MotionConfig, arrange
-from sequences.simulation.place import Place, PlaceConfig, Placed, footprint, furnish, separation
+from sequences.simulation import MotionConfig, PlaceConfig
+from sequences.simulation.motion import arrange
+from sequences.simulation.place import Place, Placed, footprint, furnish, separation
 from tests.sequences.simulation.solid_geometry import winding_numbers
 
 CONFIG = PlaceConfig(objects=12)

@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sequences.simulation.config import FOCAL_PX, SensorConfig
 from sequences.simulation.sensor import (
     BASELINE_M,
-    FOCAL_PX,
-    SensorConfig,
     lit_by_projector,
     measure_colour,
     measure_depth,

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from sequences import se3
+from sequences.simulation import MotionConfig, PlaceConfig, SensorConfig, TrajectoryConfig
 from sequences.simulation.localisation import recorded_poses
-from sequences.simulation.motion import MotionConfig, arrange
-from sequences.simulation.place import PlaceConfig, furnish
-from sequences.simulation.sensor import SensorConfig
-from sequences.simulation.trajectory import TrajectoryConfig, camera_path
+from sequences.simulation.motion import arrange
+from sequences.simulation.place import furnish
+from sequences.simulation.trajectory import camera_path
 from sequences.types import LocalisationNoise
 
 CONFIG = TrajectoryConfig(frames=26)

@@ -1,0 +1,99 @@
+"""The simulator's settings. This module imports nothing that takes long, so that all commands can show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sequences.camera import Camera
+from sequences.options import option
+from sequences.types import LocalisationNoise
+
+SENSOR_WIDTH = 640
+FOCAL_PX = 570.3422  # of the PrimeSense Carmine and Asus Xtion as OpenNI states it
+
+
+@dataclass(frozen=True)
+class PlaceConfig:
+    """What is in the place."""
+
+    objects: int = option(10, "small things in the place; classes repeat once all have been used", low=1, high=40)
+    distractors: int = option(2, "classes in the catalogue of which the place has none", low=0)
+    together: float = option(0.75, "probability that a thing stands where its category has its spot", low=0.0, high=1.0)
+    clearance_m: float = option(0.012, "least gap between the outlines of two things on one surface, metres", low=0.0)
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """The visits and what changes between them."""
+
+    visits: int = option(2, "recordings of the place", low=1, high=4)
+    gap_h: float = option(4.0, "hours from one visit to the next", low=0.05)
+    moves: int = option(1, "things taken to another surface between two visits, as far as they fit", low=0)
+
+
+@dataclass(frozen=True)
+class TrajectoryConfig:
+    """The camera's path in each visit."""
+
+    frames: int = option(26, "images of each visit", low=1)
+    period_s: float = option(0.5, "seconds between two images", low=0.001)
+    height_m: float = option(1.2, "of the camera above the floor, a head's; metres", low=0.9, high=1.6)
+    radius_m: float = option(1.1, "of the arc about the table's middle, metres", low=0.8, high=2.0)
+    arc_deg: float = option(55.0, "the arc's length, degrees", low=0.0, high=80.0)
+    pan: float = option(1.0, "how far the head turns from the table to the shelf", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The camera."""
+
+    width: int = option(640, "of the images, pixels; the height is three quarters of it", low=80, high=1280)
+    antialias: int = option(2, "each pixel's colour is the mean of so many samples each way", low=1, high=4)
+    depth_noise: float = option(1.0, "scales all noise and holes of depth; 0 is exact depth", low=0.0, high=10.0)
+    disparity_sigma_px: float = option(0.07, "noise of disparity, pixels: 1.6 mm at 1 m, 6.5 mm at 2 m", low=0.0)
+    correlation_px: float = option(0.8, "over how many pixels noise is alike", low=0.0)
+    lateral_sigma_px: float = option(0.5, "how far to the side depth is taken from, pixels", low=0.0)
+    quantisation_px: float = option(0.125, "step of disparity, pixels", low=0.0)
+    object_bias_m: float = option(0.001, "sigma of each thing's own depth error in a visit, metres", low=0.0)
+    colour_sigma: float = option(2.0, "noise of colour, of 255", low=0.0)
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics: the sensor's, scaled to the images' width."""
+        scale, height = self.width / SENSOR_WIDTH, self.width * 3 // 4
+        focal = FOCAL_PX * scale
+        return Camera(focal, focal, (self.width - 1) / 2.0, (height - 1) / 2.0, self.width, height)
+
+
+@dataclass(frozen=True)
+class LocalisationConfig:
+    """Error of the recorded camera poses; the run states it."""
+
+    rotation_rad: float = option(0.003, "standard deviation about each axis, rad", low=0.0)
+    translation_m: float = option(0.005, "standard deviation along each axis, metres", low=0.0)
+    correlation_time_s: float = option(10.0, "how long an error lasts, seconds", low=0.001)
+
+    @property
+    def noise(self) -> LocalisationNoise:
+        """As a run states it."""
+        return LocalisationNoise(self.rotation_rad, self.translation_m, self.correlation_time_s)
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """The detector."""
+
+    noise: float = option(1.0, "scales every imperfection; 0 is a perfect detector", low=0.0, high=4.0)
+    furniture: bool = option(True, "whether tables and shelves are detected too")
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """A simulated run: a corner of a room with a table, a shelf and small things, visited a few times."""
+
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    trajectory: TrajectoryConfig = field(default_factory=TrajectoryConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
