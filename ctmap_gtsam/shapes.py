@@ -12,11 +12,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull
 
 from factors.symmetry import Symmetry
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh, ObjectClass
+from sequences.distance import DistanceField, distance_field
 from sequences.meshes import simplify
 
 Array = NDArray[np.float64]
@@ -52,14 +53,14 @@ class Shape:
         return self.mesh.vertices[ConvexHull(self.mesh.vertices).vertices]
 
     @cached_property
-    def surface_tree(self) -> tuple[cKDTree, Array]:
-        """KD-tree of the faces' middles, and their normals (F, 3)."""
-        return cKDTree(self.mesh.vertices[self.mesh.faces].mean(axis=1)), self.normals
+    def distance(self) -> DistanceField:
+        """Signed distance field in the centre frame."""
+        return distance_field(self.mesh)
 
     def surface_points(self, n: int) -> Array:
         """(<= n, 3) middles of faces spread over the surface, centre frame."""
-        middles = self.surface_tree[0].data
-        return np.asarray(middles[:: max(1, len(middles) // n)])
+        middles = self.mesh.vertices[self.mesh.faces].mean(axis=1)
+        return np.asarray(middles[:: max(1, -(-len(middles) // n))])
 
     def to_object(self, T_frame_centre: Array) -> Array:
         """Poses (..., 4, 4) of the centre frame -> of the mesh frame."""

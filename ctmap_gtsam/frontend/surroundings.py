@@ -17,7 +17,7 @@ from sequences.rendering.scene import render_scene
 
 Array = NDArray[np.float64]
 
-_CONTACTS = 48  # surface points of a neighbour that are tested for penetration
+_CONTACTS = 64  # surface points of a neighbour that are tested for penetration
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,13 @@ class Surroundings:
                 points = other.shape.surface_points(_CONTACTS)
                 inside = se3.transform(se3.inverse(T[near]) @ other.T_world_centre, points)
                 deepest[near] = np.maximum(deepest[near], penetration_depth(shape, inside))
-        return hinge_log_potential(deepest, model.config.context.penetration_sigma_m)
+        tolerance = model.config.context.support_tolerance_m
+        return hinge_log_potential(deepest - tolerance, model.config.context.penetration_sigma_m)
 
 
 def penetration_depth(shape: Shape, points: Array) -> Array:
-    """How deep the deepest of points (K, P, 3), centre frame, lies inside a shape: (K,) metres, 0 outside.
-
-    The distance to the nearest surface sample, inside where that sample's normal points away.
-    """
-    tree, normals = shape.surface_tree
-    distance, nearest = tree.query(points)
-    towards = ((points - tree.data[nearest]) * normals[nearest]).sum(-1)
-    return np.where(towards < 0, distance, 0.0).max(axis=-1)
+    """How deep the deepest of points (K, P, 3), centre frame, lies inside a shape: (K,) metres, 0 outside."""
+    return np.maximum(-shape.distance.at(points), 0.0).max(axis=-1)
 
 
 def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:
