@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctmap_gtsam.cli.options import Assignments, ConfigFile, Out, RunFolder, Scene, Seed, settings, writable
+from sequences.errors import InputError
 
 if TYPE_CHECKING:
     from ctmap_gtsam.config import Config
@@ -96,14 +97,16 @@ def compare_and_show(run: Path, out: Path, config: Config, methods: list[str] | 
 
 def _estimate(method: str, run_path: Path, scene: int | None, out: Path, config: Config) -> None:
     from ctmap_gtsam.cli.show import show_estimate
-    from ctmap_gtsam.methods import METHODS
+    from ctmap_gtsam.comparing import run_methods
     from ctmap_gtsam.runtime.progress import RichProgress
     from sequences.bop import load_run
 
-    run = load_run(run_path, scene=scene)
     path = writable(out) / f"{method}.npz"
+    run = load_run(run_path, scene=scene)
     with RichProgress() as progress:
-        estimate = METHODS[method].run(run, config, progress)
-    estimate.save(path)
-    show_estimate(estimate, run.catalogue)
+        outcome = run_methods(run, [method], config, progress=progress)[method]
+    if outcome.estimate is None:
+        raise InputError(f"{method} can't run: {outcome.reason}", file=run_path, remedy=outcome.remedy)
+    outcome.estimate.save(path)
+    show_estimate(outcome.estimate, run.catalogue)
     typer.echo(path)

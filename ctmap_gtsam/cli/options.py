@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,12 +38,10 @@ def settings(file: Path | None, assignments: list[str] | None, seed: int | None 
 
 
 def writable(folder: Path) -> Path:
-    """The folder, made where it doesn't exist. InputError before any work is done where it can't be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        raise InputError(
-            f"can't be written ({error.strerror})", file=folder, remedy="choose a folder that can be written"
-        ) from error
+    """The folder, where files can be put into it or it can be made; else InputError, before any work is done."""
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(f"can't be made: {existing} is a file", file=folder, remedy="choose another folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"can't be written: no permission in {existing}", file=folder, remedy="choose another folder")
+    return folder
