@@ -8,21 +8,25 @@ filter and smoother, which weigh them with the model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth
-from ctmap_gtsam.frontend.scoring import Scores, Tile, cut_tile, refine_on_depth, score_depth
+from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine_on_depth, score_depth
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors.symmetry import residual
 from sequences import se3
+from sequences.rendering.rasteriser import Rasteriser
 from sequences.types import Detection
 
 Array = NDArray[np.float64]
+
+COARSE = 2
+"""the search looks at every so many samples: a quarter of the work, and as good for telling what is worth a closer look"""
 
 _HALF_TURNS = np.stack([np.diag(d).astype(np.float64) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
 _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
@@ -40,6 +44,12 @@ class View:
     """width, height"""
     share: float = 1.0
     """of the view that is news: its evidence is raised to this power"""
+    samples: int = 1
+    """of the full view that one of this tile stands for"""
+
+    def coarse(self) -> View:
+        """The same view with a sample in each block of `COARSE` by `COARSE`."""
+        return replace(self, tile=coarser(self.tile, COARSE), samples=self.samples * COARSE**2)
 
 
 @dataclass(frozen=True)
@@ -87,7 +97,7 @@ class Proposer:
             observation: the keyframe.
             box: where the object is looked for, pixels.
             detection: the track's detection here, if there is one.
-            surroundings: whose neighbours join the background.
+            surroundings: whose surfaces and neighbours join the background.
             share: see `Model.view_share`.
         """
         camera = observation.frame.camera
@@ -97,7 +107,7 @@ class Proposer:
         step = max(1, round(camera.fx * self.settings.angular_step_rad))
         tile = cut_tile(camera, observation.depth, observation.planes, region, step)
         if surroundings is not None:
-            tile = surroundings.behind(tile, observation.frame.T_camera_world)
+            tile = surroundings.behind(surroundings.beneath(tile, observation.frame), observation.frame)
         return View(tile, detection, (camera.width, camera.height), share)
 
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
@@ -106,6 +116,7 @@ class Proposer:
         scores = score_depth(
             shape.mesh, view.tile, T_camera_centre, self.model.depth_parameters, self.model.config.sensor.occlusion_margin_m
         )
+        scores = replace(scores, log_ratio=view.samples * scores.log_ratio)
         return view.share * self.model.log_likelihood(scores, view.detection, view.image_size), scores
 
     def search(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0) -> Array:
@@ -114,6 +125,7 @@ class Proposer:
         Args:
             share: of the configured effort.
         """
+        view = view.coarse()
         drawn = self._draw(shape, view, observation, rng, max(8, round(share * self.settings.fresh_poses)))
         if drawn is None:
             return np.zeros((0, 4, 4))
@@ -141,13 +153,17 @@ class Proposer:
     def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
 
-        A surface of unknown form explains a share of what the right mesh would; its boxes come less often, and fit as well.
+        A surface of unknown form explains a share of what the right mesh would, where the background doesn't explain the
+        depth already; its boxes come less often, and fit as well.
         """
-        detector, sensor = self.model.config.detector, self.model.config.sensor
-        _, scores = self.score(shape, view, T_camera_centre[None])
-        gain = self.model.kappa * sensor.clutter_gain * float(scores.visible[0])
+        detector = self.model.config.detector
         if view.detection is None:
             return view.share * float(np.log1p(-detector.clutter_rate))
+        rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
+        z, background, sensor = view.tile.depth, view.tile.background, self.model.config.sensor
+        seen = (rendered > 0) & (z > rendered - sensor.occlusion_margin_m)
+        surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
+        gain = self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
         box = np.array(view.detection.box)
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)

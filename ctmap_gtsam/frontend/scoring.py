@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.measurement import pixel_ratio, pixel_without_object
+from factors.measurement import pixel_past, pixel_ratio, pixel_reach, pixel_without_object
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.geometry import Plane, plane_depth
@@ -63,6 +63,13 @@ def cut_tile(
     return Tile(window, cut, plane_depth(planes, window), x0, y0, step)
 
 
+def coarser(tile: Tile, by: int) -> Tile:
+    """Every by-th sample of a tile, across and down: where many hypotheses are looked at for the first time."""
+    depth = np.ascontiguousarray(tile.depth[::by, ::by])
+    window = tile.camera.window(0, 0, depth.shape[1], depth.shape[0], by)
+    return Tile(window, depth, np.ascontiguousarray(tile.background[::by, ::by]), tile.x, tile.y, tile.step * by)
+
+
 @dataclass(frozen=True)
 class Scores:
     """What the fused kernel says of K hypotheses."""
@@ -77,44 +84,69 @@ class Scores:
     """(K, 4) enclosing box (x0, y0, x1, y1) of the visible samples in image pixels; NaN where there are none"""
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _without_object(z, background, parameters):
+    """What all hypotheses of a tile share: `pixel_without_object` (n, 6), and the log ratio where seen past (n,)."""
+    without, past = np.empty((z.size, 6)), np.zeros(z.size)
+    for p in range(z.size):
+        constants = pixel_without_object(z[p], background[p], parameters)
+        for i in range(6):
+            without[p, i] = constants[i]
+        if z[p] > 0.0:
+            past[p] = math.log(pixel_past(constants, parameters))
+    return without, past
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _score_tile(inverse_depth, zs, without, past, parameters, margin, out):
+    """Score one rendered tile (h, w) on measurements (h w,); `out` is (7,): log ratio, covered, visible, box."""
+    height, width = inverse_depth.shape
+    near_pixel, near_depth = np.empty(zs.size + 1, np.uint32), np.empty(zs.size + 1)
+    near, covered, visible = np.uintp(0), 0, 0
+    total = 0.0
+    u0, v0, u1, v1 = width, height, -1, -1
+    # without branches that pixels would take at random; those near the surface are kept for a loop of their own
+    for v in range(height):
+        first, last = width, -1
+        for u in range(width):
+            w = inverse_depth[v, u]
+            if w == 0.0:
+                continue
+            p = np.uintp(v * width + u)
+            z, rendered = zs[p], 1.0 / w
+            gap, reach = z - rendered, pixel_reach(rendered, parameters)
+            measured = z > 0.0
+            total += past[p] if gap > reach else 0.0
+            near_pixel[near], near_depth[near] = p, rendered
+            near += np.uintp(measured & (abs(gap) <= reach))
+            seen = measured & (gap > -margin)
+            covered += 1
+            visible += seen
+            first, last = min(first, u if seen else width), max(last, u if seen else -1)
+        u0, u1 = min(u0, first), max(u1, last)
+        v0, v1 = min(v0, v if last >= 0 else height), v if last >= 0 else v1
+    product = 1.0
+    for i in range(near):
+        p = np.uintp(near_pixel[i])
+        shared = (without[p, 0], without[p, 1], without[p, 2], without[p, 3], without[p, 4], without[p, 5])
+        product *= pixel_ratio(zs[p], near_depth[i], shared, parameters)
+        if not _SMALL < product < _LARGE:  # one logarithm for many pixels
+            total += math.log(product)
+            product = 1.0
+    out[0], out[1], out[2] = total + math.log(product), covered, visible
+    out[3], out[4], out[5], out[6] = u0, v0, u1, v1
+
+
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _score(vertices, faces, solid, poses, camera, depth, background, parameters, margin, out):
-    height, width = depth.shape
-    without = np.empty((height, width, 4))
-    for v in range(height):
-        for u in range(width):
-            constants = pixel_without_object(depth[v, u], background[v, u], parameters)
-            for i in range(4):
-                without[v, u, i] = constants[i]
+    zs = depth.ravel()
+    without, past = _without_object(zs, background.ravel(), parameters)
     for k in numba.prange(poses.shape[0]):
         projected = np.empty(vertices.shape)
-        inverse_depth = np.zeros((height, width))
+        inverse_depth = np.zeros(depth.shape)
         project(vertices, poses[k], camera, projected)
         rasterise(projected, faces, solid, inverse_depth, None)
-        total, product = 0.0, 1.0
-        covered, visible = 0, 0
-        u0, v0, u1, v1 = width, height, -1, -1
-        for v in range(height):
-            for u in range(width):
-                w = inverse_depth[v, u]
-                if w == 0.0:
-                    continue
-                covered += 1
-                z = depth[v, u]
-                if z == 0.0:
-                    continue
-                rendered = 1.0 / w
-                here = without[v, u]
-                product *= pixel_ratio(z, rendered, (here[0], here[1], here[2], here[3]), parameters)
-                if not _SMALL < product < _LARGE:  # one logarithm for many pixels
-                    total += math.log(product)
-                    product = 1.0
-                if z > rendered - margin:
-                    visible += 1
-                    u0, u1 = min(u0, u), max(u1, u)
-                    v0, v1 = min(v0, v), max(v1, v)
-        out[k, 0], out[k, 1], out[k, 2] = total + math.log(product), covered, visible
-        out[k, 3], out[k, 4], out[k, 5], out[k, 6] = u0, v0, u1, v1
+        _score_tile(inverse_depth, zs, without, past, parameters, margin, out[k])
 
 
 def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Array, margin_m: float) -> Scores:

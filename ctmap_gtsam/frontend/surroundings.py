@@ -12,8 +12,9 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors.context import context_log_ratio, hinge_log_potential
 from sequences import se3
-from sequences.geometry import Plane
+from sequences.geometry import Plane, plane_depth
 from sequences.rendering.scene import render_scene
+from sequences.types import Frame
 
 Array = NDArray[np.float64]
 
@@ -42,9 +43,14 @@ class Surroundings:
         """The same for one object: it is not its own neighbour."""
         return replace(self, neighbours=tuple(n for n in self.neighbours if n.object_id != object_id))
 
-    def behind(self, tile: Tile, T_camera_world: Array) -> Tile:
+    def beneath(self, tile: Tile, frame: Frame) -> Tile:
+        """The tile with known surfaces as background where this image alone shows none."""
+        known = plane_depth(tuple(s.moved(frame.T_camera_world) for s in self.supports), tile.camera)
+        return replace(tile, background=np.where(tile.background > 0, tile.background, known))
+
+    def behind(self, tile: Tile, frame: Frame) -> Tile:
         """The tile with the neighbours joined to its background: their pixels are theirs."""
-        items = [(n.shape.mesh, T_camera_world @ n.T_world_centre) for n in self.neighbours]
+        items = [(n.shape.mesh, frame.T_camera_world @ n.T_world_centre) for n in self.neighbours]
         if not items:
             return tile
         there = render_scene(items, tile.camera).depth

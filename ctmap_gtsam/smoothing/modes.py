@@ -110,16 +110,18 @@ def seed(recording: Recording, proposer: Proposer, progress: Progress) -> Found:
             for track in recording.tracks:
                 if k not in chosen[track.track_id]:
                     continue
-                _search(found[track.track_id], track, observation, proposer)
+                _search(found[track.track_id], track, observation, recording.place, proposer)
                 stage.advance()
     return found
 
 
-def _search(found: dict[int, Array], track: Track, observation: Observation, proposer: Proposer) -> None:
+def _search(
+    found: dict[int, Array], track: Track, observation: Observation, place: Place, proposer: Proposer
+) -> None:
     model = proposer.model
     detection = track.at(observation.keyframe)
     assert detection is not None
-    view = proposer.view(observation, np.array(detection.box), detection)
+    view = proposer.view(observation, np.array(detection.box), detection, Surroundings((), place.surfaces))
     for shape in model.shapes:
         stage = f"smoother.search.{shape.source.obj_id}"
         rng = generator(model.config.seed, stage, track.track_id, observation.frame.index)
