@@ -271,6 +271,8 @@ class Updater:
         self, belief: Belief, shape: Shape, view: View, observation: Observation, count: int, likely: bool
     ) -> ClassBelief | None:
         own = belief.classes[shape.index]
+        if not likely:
+            view = view.coarse()
         rng = self._rng("filter.step", belief.object_id, observation, shape)
         starts = np.zeros((0, 4, 4))
         if own is not None:

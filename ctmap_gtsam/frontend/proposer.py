@@ -26,7 +26,10 @@ from sequences.types import Detection
 Array = NDArray[np.float64]
 
 COARSE = 2
-"""the search looks at every so many samples: a quarter of the work, and as good for telling what is worth a closer look"""
+"""a first look takes every so many samples: a quarter of the work, and as good for telling what is worth a closer one"""
+
+ENOUGH_SAMPLES = 40
+"""across a tile, for it to be looked at coarsely"""
 
 _HALF_TURNS = np.stack([np.diag(d).astype(np.float64) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
 _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
@@ -48,7 +51,9 @@ class View:
     """of the full view that one of this tile stands for"""
 
     def coarse(self) -> View:
-        """The same view with a sample in each block of `COARSE` by `COARSE`."""
+        """The same view with a sample in each block of `COARSE` by `COARSE`, where enough are left."""
+        if min(self.tile.depth.shape) < ENOUGH_SAMPLES:
+            return self
         return replace(self, tile=coarser(self.tile, COARSE), samples=self.samples * COARSE**2)
 
 
@@ -147,7 +152,7 @@ class Proposer:
         score, scores = self.score(shape, view, candidates)
         keep = self._distinct(shape, candidates, score)
         poses = candidates[keep]
-        covariance, free = self._shape_of_score(shape, view, poses, scores.log_ratio[keep], probe)
+        covariance, free = self._shape_of_score(shape, view, poses, probe)
         return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance, free)
 
     def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
@@ -212,9 +217,7 @@ class Proposer:
             kept.append(int(row))
         return kept
 
-    def _shape_of_score(
-        self, shape: Shape, view: View, poses: Array, log_ratio: Array, probe: bool
-    ) -> tuple[Array, Array]:
+    def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> tuple[Array, Array]:
         """Covariances (n, 6, 6) and free axes (n, 6, 3): how far the score lets a pose go along its normal equations' axes.
 
         The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
@@ -224,12 +227,15 @@ class Proposer:
         directions = np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)  # (n, 6 directions, 6)
         if not probe:
             return self._laplace(view.share * hessian, unit), np.zeros((len(poses), 6, 3))
+        view = view.coarse()
         steps = np.concatenate([_LADDER_M, -_LADDER_M])
         offsets = directions[:, :, None] * steps[:, None] * unit
         moved = se3.retract(poses[:, None, None], offsets).reshape(-1, 4, 4)
-        depth = score_depth(shape.mesh, view.tile, moved, self.model.depth_parameters, 0.0).log_ratio
-        self.hypotheses_scored += len(moved)
-        drop = view.share * self.model.kappa * (log_ratio[:, None, None] - depth.reshape(len(poses), 6, -1))
+        around = np.concatenate([poses, moved])
+        depth = view.samples * score_depth(shape.mesh, view.tile, around, self.model.depth_parameters, 0.0).log_ratio
+        self.hypotheses_scored += len(around)
+        here, there = depth[: len(poses)], depth[len(poses) :].reshape(len(poses), 6, -1)
+        drop = view.share * self.model.kappa * (here[:, None, None] - there)
         sigma, flat = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
         scaled = directions * unit
         covariance = np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled)

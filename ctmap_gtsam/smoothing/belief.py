@@ -19,8 +19,11 @@ from factors.mixture import log_sum
 
 Array = NDArray[np.float64]
 
-_POSSIBLE = 40.0  # nats behind the best class beyond which a class is given up
-_LIKELY = 10.0  # nats behind the best class within which its modes are probed with care
+POSSIBLE = 60.0
+"""nats behind the best class beyond which a class is given up"""
+LIKELY = 15.0
+"""nats behind the best class within which its modes are probed with care"""
+
 _STAYED = 0.5
 
 
@@ -92,12 +95,12 @@ class Thing:
 
     def possible(self, model: Model) -> list[int]:
         """Classes worth another round."""
-        floor = self.class_log_evidence.max() - _POSSIBLE
+        floor = self.class_log_evidence.max() - POSSIBLE
         return [c for c in range(len(model.shapes)) if self.class_log_evidence[c] >= floor]
 
     def likely(self) -> list[int]:
         """Classes whose covariances matter."""
-        floor = self.class_log_evidence.max() - _LIKELY
+        floor = self.class_log_evidence.max() - LIKELY
         return [int(c) for c in np.flatnonzero(self.class_log_evidence >= floor)]
 
     def pose_near(self, c: int, keyframe: int) -> Array | None:

@@ -82,8 +82,18 @@ class Wanted:
     """classes whose covariance is worth probing"""
 
 
-Found = dict[int, dict[int, Array]]
-"""track -> class index -> (n, 4, 4) T_world_centre"""
+@dataclass
+class Found:
+    """What the full searches found of one track."""
+
+    poses: dict[int, Array]
+    """class index -> (n, 4, 4) T_world_centre"""
+    log_likelihood: Array
+    """(C,) of the best pose of each search, summed: what the searched views say of the class"""
+
+    def within(self, nats: float) -> list[int]:
+        """Classes that come so near to the best."""
+        return [int(c) for c in np.flatnonzero(self.log_likelihood >= self.log_likelihood.max() - nats)]
 
 
 def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progress) -> Recording:
@@ -98,12 +108,15 @@ def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progr
     return Recording(run, keyframes, associator.tracks(), place)
 
 
-def seed(recording: Recording, proposer: Proposer, progress: Progress) -> Found:
+def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[int, Found]:
     """Full searches for every track and class at a few detections, spread over the track."""
     model = proposer.model
     chosen = {t.track_id: _spread(t.keyframes, model.config.smoother.searches) for t in recording.tracks}
     at = sorted({k for keyframes in chosen.values() for k in keyframes})
-    found: Found = {t.track_id: {s.index: np.zeros((0, 4, 4)) for s in model.shapes} for t in recording.tracks}
+    found = {
+        t.track_id: Found({s.index: np.zeros((0, 4, 4)) for s in model.shapes}, np.zeros(len(model.shapes)))
+        for t in recording.tracks
+    }
     with progress.stage("search", total=sum(map(len, chosen.values()))) as stage:
         for k in at:
             observation = recording.observe(k, model.config.seed)
@@ -116,7 +129,7 @@ def seed(recording: Recording, proposer: Proposer, progress: Progress) -> Found:
 
 
 def _search(
-    found: dict[int, Array], track: Track, observation: Observation, place: Place, proposer: Proposer
+    found: Found, track: Track, observation: Observation, place: Place, proposer: Proposer
 ) -> None:
     model = proposer.model
     detection = track.at(observation.keyframe)
@@ -128,7 +141,9 @@ def _search(
         starts = proposer.search(shape, view, observation, rng, model.config.smoother.search_share)
         modes = proposer.modes(shape, view, starts, probe=False)
         poses = observation.frame.T_world_camera @ modes.T_camera_centre
-        found[shape.index] = np.concatenate([found[shape.index], poses])
+        found.poses[shape.index] = np.concatenate([found.poses[shape.index], poses])
+        # a class that explains nothing here says as much as nothing being here
+        found.log_likelihood[shape.index] += max(log_evidence(modes), 0.0)
 
 
 def _spread(keyframes: tuple[int, ...], n: int) -> frozenset[int]:

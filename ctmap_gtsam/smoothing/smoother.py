@@ -19,10 +19,10 @@ from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.smoothing.belief import Thing, judge
+from ctmap_gtsam.smoothing.belief import LIKELY, POSSIBLE, Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera, Smoothed, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved
-from ctmap_gtsam.smoothing.modes import Recording, Sighting, Wanted, gather, in_world, record, seed
+from ctmap_gtsam.smoothing.modes import Found, Recording, Sighting, Wanted, gather, in_world, record, seed
 from ctmap_gtsam.smoothing.writing import write
 from factors.symmetry import residual
 from sequences.progress import SILENT, Progress
@@ -30,7 +30,6 @@ from sequences.types import Run
 
 Array = NDArray[np.float64]
 
-_CAREFUL = 3  # classes of a track whose modes are probed with care in the first round
 _SETTLED = (0.002, 0.0002)  # rad, metres: poses that move less from round to round have settled
 
 
@@ -80,7 +79,7 @@ def smooth_run(
 def _first_round(recording: Recording, proposer: Proposer, progress: Progress) -> Map:
     """Every track is an object; it starts from what full searches found of it."""
     found = seed(recording, proposer, progress)
-    wishes = {i: _wish(found[i], proposer.model) for i in found}
+    wishes = {i: _wish(f) for i, f in found.items()}
     tracks = {t.track_id: (t,) for t in recording.tracks}
     sightings = gather(
         recording, proposer, lambda i, _: wishes[i], tracks, lambda _i, _k: (), progress, "round 1"
@@ -88,12 +87,12 @@ def _first_round(recording: Recording, proposer: Proposer, progress: Progress) -
     return _solve(recording, proposer.model, tracks, sightings)
 
 
-def _wish(found: Mapping[int, Array], model: Model) -> Wanted:
-    """All that the searches found; the class found first is no better than the rest, so none is expected but for the view."""
-    sizes = sorted(found, key=lambda c: -len(found[c]))
-    best = next((c for c in sizes if len(found[c])), None)
-    expected = None if best is None else (best, found[best][0])
-    return Wanted(found, expected, frozenset(range(len(model.shapes))))
+def _wish(found: Found) -> Wanted:
+    """All that the searches found of the classes that are still possible."""
+    best = int(np.argmax(found.log_likelihood))
+    starts = {c: found.poses[c] for c in found.within(POSSIBLE)}
+    expected = (best, found.poses[best][0]) if len(found.poses[best]) else None
+    return Wanted(starts, expected, frozenset(found.within(LIKELY)))
 
 
 def _next_round(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Map:
