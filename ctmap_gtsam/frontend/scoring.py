@@ -18,7 +18,7 @@ from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.geometry import Plane, plane_depth
 from sequences.rendering.kernels import project, rasterise
-from sequences.rendering.rasteriser import coordinates, intrinsics
+from sequences.rendering.rasteriser import PART, coordinates, intrinsics
 
 Array = NDArray[np.float64]
 
@@ -98,10 +98,12 @@ def _without_object(z, background, parameters):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _score_tile(inverse_depth, zs, without, past, parameters, margin, out):
-    """Score one rendered tile (h, w) on measurements (h w,); `out` is (7,): log ratio, covered, visible, box."""
+def _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel, near_depth, out):
+    """Score one rendered tile (h, w) on measurements (h w,); `out` is (7,): log ratio, covered, visible, box.
+
+    `near_pixel` and `near_depth` are (h w + 1,) to work in.
+    """
     height, width = inverse_depth.shape
-    near_pixel, near_depth = np.empty(zs.size + 1, np.uint32), np.empty(zs.size + 1)
     near, covered, visible = np.uintp(0), 0, 0
     total = 0.0
     u0, v0, u1, v1 = width, height, -1, -1
@@ -141,12 +143,15 @@ def _score_tile(inverse_depth, zs, without, past, parameters, margin, out):
 def _score(vertices, faces, solid, poses, camera, depth, background, parameters, margin, out):
     zs = depth.ravel()
     without, past = _without_object(zs, background.ravel(), parameters)
-    for k in numba.prange(poses.shape[0]):
-        projected = np.empty(vertices.shape)
-        inverse_depth = np.zeros(depth.shape)
-        project(vertices, poses[k], camera, projected)
-        rasterise(projected, faces, solid, inverse_depth, None)
-        _score_tile(inverse_depth, zs, without, past, parameters, margin, out[k])
+    for part in numba.prange((len(poses) + PART - 1) // PART):
+        projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape)
+        chosen = np.empty((2, len(faces) + 1), np.int32)
+        near_pixel, near_depth = np.empty(zs.size + 1, np.uint32), np.empty(zs.size + 1)
+        for k in range(part * PART, min(part * PART + PART, len(poses))):
+            inverse_depth[:] = 0.0
+            project(vertices, poses[k], camera, projected)
+            rasterise(projected, faces, solid, chosen, inverse_depth, None)
+            _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
 
 
 def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Array, margin_m: float) -> Scores:
@@ -182,10 +187,10 @@ def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Arra
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(projected, faces, solid, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
+def _normal_equations(projected, faces, solid, chosen, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
     """Point-to-plane normal equations of one pose in its own right tangent; returns the sum of weights."""
     inverse_depth[:] = 0.0
-    rasterise(projected, faces, solid, inverse_depth, ids)
+    rasterise(projected, faces, solid, chosen, inverse_depth, ids)
     H[:] = 0.0
     g[:] = 0.0
     total = 0.0
@@ -246,6 +251,7 @@ def _move(T, xi):
 def _refine(vertices, faces, solid, normals, poses, camera, depth, widths, hessians):
     for k in numba.prange(poses.shape[0]):
         projected = np.empty(vertices.shape)
+        chosen = np.empty((2, len(faces) + 1), np.int32)
         inverse_depth = np.empty(depth.shape)
         ids = np.zeros(depth.shape, np.int32)
         H, g = np.empty((6, 6)), np.empty(6)
@@ -253,7 +259,7 @@ def _refine(vertices, faces, solid, normals, poses, camera, depth, widths, hessi
         for step in range(widths.shape[0]):
             project(vertices, T, camera, projected)
             total = _normal_equations(
-                projected, faces, solid, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
+                projected, faces, solid, chosen, normals, T, camera, depth, inverse_depth, ids, widths[step], H, g
             )
             hessians[k] = H
             if total < 6.0:

@@ -22,7 +22,6 @@ _MIN_AREA = 1e-8  # square pixels; below it barycentric coordinates are rounding
 _ON_EDGE = 1e-9  # a sample on an edge belongs to both triangles, whatever way the rounding goes
 _FAR = 1e30
 
-_NARROW = 8  # wider triangles are drawn row by row between their edges
 
 _index = np.uintp
 # no kernel makes an infinity or NaN, and without them minimum, maximum and choice are one instruction each
@@ -71,22 +70,21 @@ def project(vertices, T, intrinsics, projected):
 
 
 @numba.njit(**_KERNEL)
-def rasterise(projected, faces, solid, inverse_depth, face_ids):
+def rasterise(projected, faces, solid, chosen, inverse_depth, face_ids):
     """Draw triangles into a buffer of inverse depth, the nearest surface winning, of equal ones either.
 
     Args:
         projected: (3, V) from `project`.
         faces: (F, 3).
         solid: leave out faces that are seen from behind; see `catalogue.Mesh.is_solid`.
+        chosen: (2, F + 1) int32 to work in: allocating for each pose takes as long as drawing it.
         inverse_depth: (h, w), updated in place; 0 = nothing.
         face_ids: (h, w), updated in place with the face that won; None where nobody wants them.
     """
     height, width = inverse_depth.shape
-    small = np.empty(faces.shape[0] + 1, np.int32)
-    large = np.empty(faces.shape[0] + 1, np.int32)
-    n_small, n_large = _select(projected, faces, solid, height, width, small, large)
-    _draw_small(projected, faces, small[:n_small], inverse_depth, face_ids)
-    _draw_large(projected, faces, large[:n_large], inverse_depth, face_ids)
+    n_small, n_large = _select(projected, faces, solid, height, width, chosen[0], chosen[1])
+    _draw_small(projected, faces, chosen[0, :n_small], inverse_depth, face_ids)
+    _draw_large(projected, faces, chosen[1, :n_large], inverse_depth, face_ids)
 
 
 @numba.njit(**_KERNEL)
@@ -159,39 +157,6 @@ def _draw_small(projected, faces, chosen, inverse_depth, face_ids):
         _put(inverse_depth, face_ids, below, right, min(la + au, lb + bu, lc + cu), w + wu, f)
 
 
-@numba.njit(**_KERNEL)
-def _draw_large(projected, faces, chosen, inverse_depth, face_ids):
-    us, vs, ws = projected[0], projected[1], projected[2]
-    u_last, v_last = inverse_depth.shape[1] - 1.0, inverse_depth.shape[0] - 1.0
-    for i in range(_index(chosen.shape[0])):
-        f = _index(chosen[i])
-        a, b, c = _index(faces[f, 0]), _index(faces[f, 1]), _index(faces[f, 2])
-        ua, va, wa, ub, vb, wb, uc, vc, wc = us[a], vs[a], ws[a], us[b], vs[b], ws[b], us[c], vs[c], ws[c]
-        bu, bv, cu, cv, wu, wv = _gradients(ua, va, wa, ub, vb, wb, uc, vc, wc)
-        left, right = max(0.0, np.ceil(min(ua, ub, uc))), min(u_last, np.floor(max(ua, ub, uc)))
-        top, bottom = max(0.0, np.ceil(min(va, vb, vc))), min(v_last, np.floor(max(va, vb, vc)))
-        columns, rows = np.int64(right - left) + 1, np.int64(bottom - top) + 1
-        u, v = _index(np.int64(left)), _index(np.int64(top))
-        du, dv = left - ua, top - va
-        lb, lc, w = bu * du + bv * dv + _ON_EDGE, cu * du + cv * dv + _ON_EDGE, wa + wu * du + wv * dv
-        if columns <= _NARROW:
-            _draw_box(inverse_depth, face_ids, u, v, columns, rows, lb, bu, bv, lc, cu, cv, w, wu, wv, f)
-        else:
-            _draw_rows(inverse_depth, face_ids, u, v, columns, rows, lb, bu, bv, lc, cu, cv, w, wu, wv, f)
-
-
-@numba.njit(**_KERNEL)
-def _draw_box(inverse_depth, face_ids, u, v, columns, rows, lb, bu, bv, lc, cu, cv, w, wu, wv, f):
-    """Test all samples of a box: barycentric coordinates lb, lc and inverse depth w at its corner, and their steps."""
-    la, au, av = 1.0 + 3.0 * _ON_EDGE - lb - lc, -bu - cu, -bv - cv
-    for j in range(_index(rows)):
-        a, b, c, here = la, lb, lc, w
-        for i in range(_index(columns)):
-            _put(inverse_depth, face_ids, v + j, u + i, min(a, b, c), here, f)
-            a, b, c, here = a + au, b + bu, c + cu, here + wu
-        la, lb, lc, w = la + av, lb + bv, lc + cv, w + wv
-
-
 @numba.njit(**_KERNEL, inline="always")
 def _crossing(l0, lu, lv):
     """Where l0 + lu i + lv j >= 0 in row j: from `low + low_step j` to `high + high_step j`."""
@@ -202,16 +167,34 @@ def _crossing(l0, lu, lv):
 
 
 @numba.njit(**_KERNEL)
-def _draw_rows(inverse_depth, face_ids, u, v, columns, rows, lb, bu, bv, lc, cu, cv, w, wu, wv, f):
-    """Draw the samples between a triangle's edges in each row; arguments as of `_draw_box`."""
-    a_low, a_low_step, a_high, a_high_step = _crossing(1.0 + 3.0 * _ON_EDGE - lb - lc, -bu - cu, -bv - cv)
-    b_low, b_low_step, b_high, b_high_step = _crossing(lb, bu, bv)
-    c_low, c_low_step, c_high, c_high_step = _crossing(lc, cu, cv)
-    last = columns - 1.0
-    for j in range(_index(rows)):
-        y = np.float64(j)
-        low = max(0.0, a_low + a_low_step * y, b_low + b_low_step * y, c_low + c_low_step * y)
-        high = min(last, a_high + a_high_step * y, b_high + b_high_step * y, c_high + c_high_step * y)
-        start = w + wv * y
-        for i in range(np.int64(np.ceil(min(low, last + 1.0))), np.int64(np.floor(max(high, -1.0))) + 1):
-            _put(inverse_depth, face_ids, v + j, u + _index(i), 0.0, start + wu * i, f)
+def _draw_large(projected, faces, chosen, inverse_depth, face_ids):
+    us, vs, ws = projected[0], projected[1], projected[2]
+    u_last, v_last = inverse_depth.shape[1] - 1.0, inverse_depth.shape[0] - 1.0
+    for k in range(_index(chosen.shape[0])):
+        f = _index(chosen[k])
+        a, b, c = _index(faces[f, 0]), _index(faces[f, 1]), _index(faces[f, 2])
+        ua, va, wa, ub, vb, wb, uc, vc, wc = us[a], vs[a], ws[a], us[b], vs[b], ws[b], us[c], vs[c], ws[c]
+        bu, bv, cu, cv, wu, wv = _gradients(ua, va, wa, ub, vb, wb, uc, vc, wc)
+        left, right = max(0.0, np.ceil(min(ua, ub, uc))), min(u_last, np.floor(max(ua, ub, uc)))
+        top, bottom = max(0.0, np.ceil(min(va, vb, vc))), min(v_last, np.floor(max(va, vb, vc)))
+        u, v = _index(np.int64(left)), _index(np.int64(top))
+        du, dv = left - ua, top - va
+        lb, lc, w = bu * du + bv * dv + _ON_EDGE, cu * du + cv * dv + _ON_EDGE, wa + wu * du + wv * dv
+        a_low, a_low_step, a_high, a_high_step = _crossing(1.0 + 3.0 * _ON_EDGE - lb - lc, -bu - cu, -bv - cv)
+        b_low, b_low_step, b_high, b_high_step = _crossing(lb, bu, bv)
+        c_low, c_low_step, c_high, c_high_step = _crossing(lc, cu, cv)
+        last = right - left
+        for j in range(_index(np.int64(bottom - top) + 1)):
+            y = np.float64(j)
+            low = max(0.0, a_low + a_low_step * y, b_low + b_low_step * y, c_low + c_low_step * y)
+            high = min(last, a_high + a_high_step * y, b_high + b_high_step * y, c_high + c_high_step * y)
+            row, start = v + j, w + wv * y
+            # most rows of a sliver hold at most two samples: these without branches, as the number is hard to foresee
+            first = min(np.ceil(low), last)
+            second = min(first + 1.0, last)
+            i = _index(np.int64(first))
+            _put(inverse_depth, face_ids, row, u + i, min(high - first, first - low), start + wu * first, f)
+            i = _index(np.int64(second))
+            _put(inverse_depth, face_ids, row, u + i, min(high - second, second - low), start + wu * second, f)
+            for i in range(np.int64(first) + 2, np.int64(np.floor(max(high, -1.0))) + 1):
+                _put(inverse_depth, face_ids, row, u + _index(i), 0.0, start + wu * i, f)

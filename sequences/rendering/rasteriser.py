@@ -12,6 +12,9 @@ from sequences.rendering.kernels import project, rasterise
 
 Array = NDArray[np.float64]
 
+PART = 16
+"""poses that share what a kernel works in"""
+
 
 class Rasteriser:
     """The renderer that the estimators score with."""
@@ -25,7 +28,7 @@ class Rasteriser:
     def render(self, mesh: Mesh, camera: Camera, T_camera_object: Array) -> NDArray[np.float32]:
         """See `DepthRenderer.render`."""
         poses = np.ascontiguousarray(T_camera_object, dtype=np.float64).reshape(-1, 4, 4)
-        depth = np.zeros((len(poses), camera.height, camera.width), dtype=np.float32)
+        depth = np.empty((len(poses), camera.height, camera.width), dtype=np.float32)
         _render(coordinates(mesh), mesh.faces, mesh.is_solid, poses, intrinsics(camera), depth)
         return depth
 
@@ -42,12 +45,14 @@ def intrinsics(camera: Camera) -> Array:
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _render(vertices, faces, solid, poses, intrinsics, depth):
-    for k in numba.prange(poses.shape[0]):
-        projected = np.empty(vertices.shape)
-        inverse_depth = np.zeros(depth.shape[1:])
-        project(vertices, poses[k], intrinsics, projected)
-        rasterise(projected, faces, solid, inverse_depth, None)
-        for v in range(depth.shape[1]):
-            for u in range(depth.shape[2]):
-                if inverse_depth[v, u] > 0.0:
-                    depth[k, v, u] = 1.0 / inverse_depth[v, u]
+    for part in numba.prange((len(poses) + PART - 1) // PART):
+        projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape[1:])
+        chosen = np.empty((2, len(faces) + 1), np.int32)
+        for k in range(part * PART, min(part * PART + PART, len(poses))):
+            inverse_depth[:] = 0.0
+            project(vertices, poses[k], intrinsics, projected)
+            rasterise(projected, faces, solid, chosen, inverse_depth, None)
+            for v in range(depth.shape[1]):
+                for u in range(depth.shape[2]):
+                    w = inverse_depth[v, u]
+                    depth[k, v, u] = 1.0 / w if w > 0.0 else 0.0

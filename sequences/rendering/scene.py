@@ -48,7 +48,7 @@ def render_scene(items: Items, camera: Camera) -> SceneImages:
     projected, drawn, origin = _clip_and_project(vertices, faces, intrinsics(camera))
     inverse_depth = np.zeros((camera.height, camera.width))
     ids = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    rasterise(projected, drawn, False, inverse_depth, ids)
+    rasterise(projected, drawn, False, np.empty((2, len(drawn) + 1), dtype=np.int32), inverse_depth, ids)
     return _unpack(inverse_depth, ids, origin, offsets)
 
 
