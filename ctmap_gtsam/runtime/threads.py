@@ -15,3 +15,5 @@ def limit_library_threads() -> None:
     """
     for name in _POOLS:
         os.environ.setdefault(name, "1")
+    # threads that wait for work spin by default, and on a busy machine take the core from those that have some
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
