@@ -11,6 +11,9 @@ from ctmap_gtsam.cli.estimators import compare_and_show
 from ctmap_gtsam.cli.options import Assignments, ConfigFile, JsonFile, Seed, settings, writable
 from ctmap_gtsam.cli.runs import simulate_into
 
+DEMO_SETTINGS = Path(__file__).parent / "demo.toml"
+DEMO_METHODS = ["detector", "filter-ct", "smooth-ct"]
+
 
 def demo(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the run and the results.")] = Path(
@@ -22,12 +25,14 @@ def demo(
 ) -> None:
     """Simulate a small run, filter it, smooth it, compare the two and write a report.
 
+    The settings are the demo's own, unless --config gives others.
+
     Example: `ctmap demo --out ctmap-demo`
     """
-    config = settings(config_file, assignments, seed)
+    chosen = settings(config_file or DEMO_SETTINGS, assignments, seed)
     run = writable(out) / "run"
-    simulate_into(run, config)
-    compare_and_show(run, out, config, methods=None, scene=None)
+    simulate_into(run, chosen)
+    compare_and_show(run, out, chosen, DEMO_METHODS, scene=None)
 
 
 def config(config_file: ConfigFile = None, assignments: Assignments = None, seed: Seed = None) -> None:
