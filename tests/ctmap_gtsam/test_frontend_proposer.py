@@ -1,0 +1,238 @@
+"""Laws of the proposals: the truth is among them, each mode once, and as certain as the image allows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.scoring import refine_on_depth
+from ctmap_gtsam.model import Model
+from factors.symmetry import residual
+from sequences import se3
+from sequences.catalogue import Catalogue, Mesh
+from sequences.seeds import generator
+from tests.ctmap_gtsam.scenes import (
+    box_of,
+    classes,
+    config_of,
+    detection_of,
+    frame_of,
+    looking,
+    model_of,
+    shape_named,
+    standing,
+    view_of,
+)
+
+NAMES = ("mug", "banana", "hammer", "cereal_box", "soup_can", "sponge")
+MODEL = model_of(*NAMES)
+
+
+def scene(name, seed=0, **options):
+    """Proposer, shape, view, observation and the true T_camera_centre of one thing on the table."""
+    rng = np.random.default_rng(seed)
+    model = MODEL
+    shape = shape_named(model, name)
+    T_world_camera = looking(rng.uniform(-3, 3), 0.65, rng.uniform(0.5, 0.9))
+    pose = standing(shape, 0.0, 0.0, rng.uniform(-3, 3))
+    observation = view_of(model, [(shape, pose)], T_world_camera)
+    proposer = Proposer(model)
+    detection = observation.frame.detections[0]
+    view = proposer.view(observation, np.array(detection.box), detection, **options)
+    return proposer, shape, view, observation, se3.inverse(T_world_camera) @ pose
+
+
+def errors(T, poses, shape):
+    r = residual(T, poses, shape.symmetry)
+    return np.linalg.norm(r[..., :3], axis=-1), np.linalg.norm(r[..., 3:], axis=-1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_from_five_centimetres_and_twenty_degrees_exact_depth_gives_the_truth(name):
+    """Law 8 of the model, by the registration that a search does: wide at first, then narrow."""
+    proposer, shape, view, _, T = scene(name)
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(48, 2, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    starts = se3.retract(T, (direction * [[np.radians(20.0)], [0.05]]).reshape(48, 6))
+    widths = np.geomspace(*proposer.settings.refinement_widths_m, 10)
+    nearer, _ = refine_on_depth(shape.mesh, shape.normals, view.tile, starts, widths)
+    turned, moved = errors(T, proposer.modes(shape, view, nearer, probe=False).T_camera_centre[:1], shape)
+    assert turned[0] < np.radians(0.5)
+    assert moved[0] < 0.0005
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_search_on_exact_depth_finds_the_truth_or_what_looks_like_it(name):
+    proposer, shape, view, observation, T = scene(name)
+    starts = proposer.search(shape, view, observation, generator(0, "test"))
+    modes = proposer.modes(shape, view, starts, probe=False)
+    truth, _ = proposer.score(shape, view, T[None])
+    assert modes.log_likelihood[0] > truth[0] - 0.5
+    turned, moved = errors(T, modes.T_camera_centre, shape)
+    assert ((turned < 0.02) & (moved < 0.001)).any()
+
+
+@pytest.mark.parametrize("name", ["sponge", "soup_can"])
+def test_images_of_one_pose_under_a_symmetry_are_one_mode(name):
+    proposer, shape, view, _, T = scene(name)
+    images = T @ shape.symmetry.discrete
+    if shape.symmetry.free:
+        turns = se3.make(se3.so3_exp(np.linspace(-3, 3, 7)[:, None] * shape.symmetry.axes[0]), np.zeros(3))
+        images = (images[:, None] @ turns).reshape(-1, 4, 4)
+    modes = proposer.modes(shape, view, images, probe=False)
+    assert len(modes) == 1
+    assert errors(T, modes.T_camera_centre, shape)[1][0] < 0.0005
+
+
+def test_modes_are_apart_best_first_and_no_more_than_asked_for():
+    proposer, shape, view, observation, T = scene("hammer")
+    starts = proposer.search(shape, view, observation, generator(0, "test"), 0.5)
+    modes = proposer.modes(shape, view, np.concatenate([starts, starts[::-1], T[None]]), probe=False)
+    assert 1 <= len(modes) <= proposer.settings.max_modes
+    assert (np.diff(modes.log_likelihood) <= 0).all()
+    for i in range(len(modes)):
+        turned, moved = errors(modes.T_camera_centre[i], np.delete(modes.T_camera_centre, i, axis=0), shape)
+        assert ((turned > 0.05) | (moved > 0.004)).all()
+    assert len(proposer.modes(shape, view, np.zeros((0, 4, 4)))) == 0
+
+
+def test_no_mode_scores_less_than_its_start():
+    proposer, shape, view, _, T = scene("mug")
+    starts = se3.retract(T, np.random.default_rng(3).normal(size=(10, 6)) * np.repeat([0.3, 0.02], 3))
+    at_start, _ = proposer.score(shape, view, starts)
+    modes = proposer.modes(shape, view, starts, probe=False)
+    assert modes.log_likelihood[0] >= at_start.max()
+    again, scores = proposer.score(shape, view, modes.T_camera_centre)
+    np.testing.assert_allclose(again, modes.log_likelihood)
+    np.testing.assert_allclose(proposer.model.kappa * scores.log_ratio, modes.depth_log_ratio)
+
+
+def bare_cylinder():
+    """A model of a smooth cylinder that the catalogue takes for a thing without symmetry."""
+    made = trimesh.creation.cylinder(0.035, 0.11, sections=72)
+    faces, colours = np.asarray(made.faces, dtype=np.int32), np.full((len(made.vertices), 3), 99, dtype=np.uint8)
+    mesh = Mesh(np.asarray(made.vertices, dtype=np.float64), faces, colours)
+    (can,) = classes("soup_can").classes
+    source = replace(can, mesh=mesh, symmetries_discrete=np.eye(4)[None], symmetries_continuous=())
+    return Model(Catalogue((source,)), MODEL.config)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_a_turn_that_the_image_doesnt_show_is_not_certain(seed):
+    rng = np.random.default_rng(seed)
+    model = bare_cylinder()
+    (shape,) = model.shapes
+    T_world_camera = looking(rng.uniform(-3, 3), rng.uniform(0.5, 0.9), rng.uniform(0.3, 0.9))
+    pose = standing(shape, yaw=rng.uniform(-3, 3))
+    observation = view_of(model, [(shape, pose)], T_world_camera)
+    detection = observation.frame.detections[0]
+    proposer = Proposer(model)
+    view = proposer.view(observation, np.array(detection.box), detection)
+    modes = proposer.modes(shape, view, (se3.inverse(T_world_camera) @ pose)[None])
+    sigma = np.sqrt(np.diag(modes.covariance[0]))
+    assert sigma[2] > np.radians(20.0)
+    assert (sigma[:2] < np.radians(5.0)).all()
+    assert (sigma[3:] < 0.005).all()
+    np.testing.assert_allclose(np.linalg.norm(modes.free_axes[0].T @ np.eye(6)[2]), 1.0, atol=0.01)
+
+
+def test_a_turn_that_the_image_shows_is_certain():
+    proposer, shape, view, _, T = scene("hammer")
+    modes = proposer.modes(shape, view, T[None])
+    sigma = np.sqrt(np.diag(modes.covariance[0]))
+    assert (sigma[:3] < np.radians(8.0)).all()
+    assert (sigma[3:] < 0.01).all()
+    assert (np.linalg.eigvalsh(modes.covariance[0]) > 0).all()
+
+
+def test_a_score_falls_by_half_a_nat_at_a_standard_deviation():
+    """What the covariance says is what the score does, direction by direction, to the ladder's coarseness."""
+    proposer, shape, view, _, T = scene("banana")
+    modes = proposer.modes(shape, view, T[None])
+    values, vectors = np.linalg.eigh(modes.covariance[0])
+    steps = np.sqrt(values) * vectors
+    both = np.stack([steps.T, -steps.T])
+    best = modes.T_camera_centre[0]
+    plain = replace(view, detection=None)
+    top = proposer.score(shape, plain, best[None])[1].log_ratio
+    moved = proposer.score(shape, plain, se3.retract(best, both.reshape(-1, 6)))[1].log_ratio
+    drop = proposer.model.kappa * (top - moved).reshape(2, 6).mean(0)
+    assert ((drop > 0.1) & (drop < 2.5)).all()
+
+
+def test_less_news_makes_a_mode_less_certain_and_less_of_an_argument():
+    proposer, shape, view, _, T = scene("mug")
+    full, some = (proposer.modes(shape, replace(view, share=share), T[None]) for share in (1.0, 0.1))
+    assert some.log_likelihood[0] == pytest.approx(0.1 * full.log_likelihood[0], rel=0.05)
+    assert np.trace(some.covariance[0]) > np.trace(full.covariance[0])
+
+
+def test_the_right_class_explains_depth_better_than_clutter_and_others():
+    model = MODEL
+    for name in ("mug", "banana", "cereal_box"):
+        proposer, shape, view, observation, T = scene(name)
+        own, _ = proposer.score(shape, view, T[None])
+        assert own[0] > proposer.log_clutter(shape, view, T) > 0.0
+        for other in model.shapes:
+            if other is shape:
+                continue
+            starts = proposer.search(other, view, observation, generator(0, "test"), 0.2)
+            assert proposer.modes(other, view, starts, probe=False).log_likelihood[0] < own[0] - 1.0
+
+
+def test_an_empty_table_speaks_against_a_thing_on_it():
+    proposer, shape, _view, observation, T = scene("mug")
+    empty = view_of(MODEL, [], observation.frame.T_world_camera)
+    box = np.array(box_of(shape, T))
+    bare = proposer.view(empty, box, None)
+    assert proposer.score(shape, bare, T[None])[0][0] < -3.0
+    hidden = frame_of(0, observation.frame.T_world_camera, np.full_like(observation.depth, 0.2))
+    unseen = proposer.view(replace(empty, frame=hidden, depth=hidden.read_depth()), box, None)
+    assert proposer.score(shape, unseen, T[None])[0][0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_leaving_ones_box_is_never_rewarded():
+    proposer, shape, view, _, T = scene("cereal_box")
+    with_box, _ = proposer.score(shape, view, T[None])
+    shift = detection_of(shape, se3.make(np.eye(3), np.array([0.1, 0, 0])) @ T, len(MODEL.shapes))
+    elsewhere, _ = proposer.score(shape, replace(view, detection=shift), T[None])
+    missed, _ = proposer.score(shape, replace(view, detection=None), T[None])
+    assert with_box[0] > elsewhere[0]
+    assert with_box[0] > missed[0]
+
+
+def test_the_same_draws_give_the_same_search_and_other_draws_another():
+    proposer, shape, view, observation, _ = scene("mug")
+    a, b, c = (proposer.search(shape, view, observation, generator(0, stage), 0.1) for stage in ("x", "x", "y"))
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_hypotheses_are_counted():
+    proposer, shape, view, _, T = scene("mug")
+    proposer.score(shape, view, np.tile(T, (17, 1, 1)))
+    assert proposer.hypotheses_scored == 17
+
+
+def test_a_box_without_depth_finds_nothing():
+    proposer, shape, view, observation, _ = scene("mug")
+    blind = replace(observation, depth=np.zeros_like(observation.depth))
+    assert proposer.search(shape, view, blind, generator(0, "test")).shape == (0, 4, 4)
+
+
+def test_effort_is_what_the_settings_say():
+    model = model_of("mug", config=config_of("frontend.fresh_poses=50", "frontend.refined_poses=6"))
+    (shape,) = model.shapes
+    observation = view_of(model, [(shape, standing(shape))], looking())
+    detection = observation.frame.detections[0]
+    counts = []
+    for share in (1.0, 0.4):
+        proposer = Proposer(model)
+        view = proposer.view(observation, np.array(detection.box), detection)
+        proposer.search(shape, view, observation, generator(0, "test"), share)
+        counts.append(proposer.hypotheses_scored)
+    assert 50 <= counts[0] <= 100
+    assert counts[1] < counts[0]
