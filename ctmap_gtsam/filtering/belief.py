@@ -317,10 +317,10 @@ class Updater:
         log_uniform = self.model.log_uniform(shape)
         if proposals is None and own is None:
             return None
-        jump = self.model.config.prediction.jump_probability
-        share = 1.0 if own is None else self.model.config.filter.proposal_share if proposals is not None else 0.0
+        settings = self.model.config.filter
+        share = 1.0 if own is None else settings.proposal_share if proposals is not None else 0.0
         n_proposed = round(share * count)
-        drawn, log_q = [], []
+        drawn = []
         if own is not None and spread is not None:
             drawn.append(predict(own.particles, count - n_proposed, spread, shape, rng))
         if proposals is not None:
@@ -328,13 +328,16 @@ class Updater:
         T = np.concatenate(drawn)
         log_prior = np.full(len(T), log_uniform)
         if own is not None and spread is not None:
+            jump = self.model.config.prediction.jump_probability
             predicted = predicted_log_density(own.particles, T, spread, shape)
             log_prior = np.logaddexp(np.log1p(-jump) + predicted, np.log(jump) + log_uniform)
-            log_q.append(np.log1p(-share) + predicted)
+        log_q = log_prior
         if proposals is not None:
-            log_q.append(np.log(share) + proposals.log_density(T, shape))
+            # the prior is part of the mixture, so no weight exceeds the likelihood by more than 1 / (1 - share)
+            proposed = np.log(share) + proposals.log_density(T, shape)
+            log_q = proposed if own is None else np.logaddexp(np.log1p(-share) + log_prior, proposed)
         score, _ = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
-        log_weight = log_prior + score - np.logaddexp.reduce(log_q, axis=0)
+        log_weight = log_prior + score - log_q
         gained = float(log_sum(log_weight)) - np.log(len(T))
         before = 0.0 if own is None else own.log_evidence
         return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from ctmap_gtsam.shapes import Shape
 from factors import mixture, symmetry
@@ -97,14 +98,15 @@ def predict(particles: Particles, n: int, spread: Spread, shape: Shape, rng: np.
 def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape: Shape) -> Array:
     """log sum_k w_k phi_p(x | x_k) (K,) at poses (K, 4, 4), over poses modulo the object's symmetries."""
     S = shape.symmetry
-    reference = particles.best(1)[0]
-    a = _features(symmetry.nearest_image(reference, particles.T_world_centre, S), shape, spread)
-    b = _features(symmetry.nearest_image(reference, T, S), shape, spread)
+    # a pose and its predecessor may be written in different equivalent poses: sum over all of them
+    images = (T[:, None] @ S.discrete).reshape(-1, 4, 4)
+    a, b = _features(particles.T_world_centre, shape, spread), _features(images, shape, spread)
     squared = np.maximum((b**2).sum(-1)[:, None] + (a**2).sum(-1) - 2.0 * b @ a.T, 0.0)
     turns = 3 - S.free
     constant = turns * (np.log(spread.rotation_rad) + 0.5 * LOG_2PI)
     constant += 3 * (np.log(spread.translation_m) + 0.5 * LOG_2PI)
-    return mixture.log_sum(particles.log_weight - 0.5 * squared) - constant
+    exponent = (particles.log_weight - 0.5 * squared).reshape(len(T), -1)
+    return logsumexp(exponent, axis=-1) - constant
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
