@@ -33,7 +33,8 @@ VISIBLE_FRACTION = 0.1
 """A true object counts in a frame where at least this share of its silhouette is visible (BOP's threshold)"""
 
 REACH_M = 0.05
-"""Centres further apart than this, or than half the reference object's diameter where that is more, don't match"""
+"""Centres further apart than this, or than half the smaller object's diameter where that is more, don't match. The
+smaller one's: a mug somewhere on a table isn't the table"""
 
 HIDDEN_WEIGHT = 1e-6
 """Weight of frames where the reference object is hidden: it decides nothing but ties, and lets an estimate of an object
@@ -146,19 +147,19 @@ def match(reference: ObjectFrames, candidates: ObjectFrames, shapes: dict[int, S
 def _closeness(reference: ObjectFrames, candidates: ObjectFrames, shapes: dict[int, Shape]) -> Array:
     """(N, M) sum over frames of 1 - min(distance / reach, 1): least cost, seen from the other side."""
     weight = np.where(reference.visible, 1.0, HIDDEN_WEIGHT)
-    reach = _reach(reference, shapes)
+    reach, their_reach = _reach(reference, shapes), _reach(candidates, shapes)
     ours, theirs = centres(reference, shapes), centres(candidates, shapes)
     out = np.zeros((len(reference.name), len(candidates.name)))
     for n in range(len(out)):
         distance = np.linalg.norm(theirs - ours[n], axis=-1)  # (M, F)
-        share = 1.0 - np.minimum(np.nan_to_num(distance, nan=np.inf) / reach[n], 1.0)
+        share = 1.0 - np.minimum(np.nan_to_num(distance, nan=np.inf) / np.minimum(reach[n], their_reach), 1.0)
         out[n] = share @ weight[n]
     return out
 
 
-def _reach(reference: ObjectFrames, shapes: dict[int, Shape]) -> Array:
-    """(N, F) metres."""
-    out = np.full(reference.class_id.shape, REACH_M)
-    for obj_id in np.unique(reference.class_id[reference.present]):
-        out[reference.class_id == obj_id] = max(REACH_M, 0.5 * shapes[int(obj_id)].of.diameter_m)
+def _reach(objects: ObjectFrames, shapes: dict[int, Shape]) -> Array:
+    """(N, F) of each object by its own size, metres."""
+    out = np.full(objects.class_id.shape, REACH_M)
+    for obj_id in np.unique(objects.class_id[objects.present]):
+        out[objects.class_id == obj_id] = max(REACH_M, 0.5 * shapes[int(obj_id)].of.diameter_m)
     return out
