@@ -63,7 +63,9 @@ class _Panel:
     beliefs: Mapping[str, Array]
 
 
-def error_over_time(comparison: Comparison, methods: Sequence[str], error: str = "mssd_m") -> Figure:
+def error_over_time(
+    comparison: Comparison, methods: Sequence[str], error: str = "mssd_m", objects: Sequence[str] | None = None
+) -> Figure:
     """One panel a true object: the error of each frame's own estimate, one line a method.
 
     Without truth, one panel an object of the reference method: how far the other methods' boxes are from its.
@@ -72,9 +74,10 @@ def error_over_time(comparison: Comparison, methods: Sequence[str], error: str =
         comparison: from `compare`.
         methods: those to draw, in this order.
         error: a key of ERRORS; without truth it is the distance, whatever is asked.
+        objects: of `Comparison.labels`, those to draw; all where not given, and without truth.
     """
     name, unit, _ = ERRORS[error] if comparison.truth is not None else ("apart", "mm", 1e3)
-    panels = _panels(comparison, methods, error)
+    panels = _panels(comparison, methods, error, objects)
     figure, axes = _grid(comparison, panels)
     for ax, panel in zip(axes, panels, strict=True):
         _draw_errors(ax, comparison, panel, methods)
@@ -82,12 +85,17 @@ def error_over_time(comparison: Comparison, methods: Sequence[str], error: str =
     return figure
 
 
-def belief_over_time(comparison: Comparison, methods: Sequence[str]) -> Figure:
+def belief_over_time(comparison: Comparison, methods: Sequence[str], objects: Sequence[str] | None = None) -> Figure:
     """One panel an object: P(exists) P(its true class), one line a method.
 
     Without truth, one panel an object of the reference method, and P of the class that it ends with.
+
+    Args:
+        comparison: from `compare`.
+        methods: those to draw, in this order.
+        objects: of `Comparison.labels`, those to draw; all where not given, and without truth.
     """
-    panels = _panels(comparison, methods, "mssd_m")
+    panels = _panels(comparison, methods, "mssd_m", objects)
     figure, axes = _grid(comparison, panels)
     for ax, panel in zip(axes, panels, strict=True):
         for method, values in panel.beliefs.items():
@@ -106,7 +114,7 @@ def svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def _panels(comparison: Comparison, methods: Sequence[str], error: str) -> list[_Panel]:
+def _panels(comparison: Comparison, methods: Sequence[str], error: str, objects: Sequence[str] | None) -> list[_Panel]:
     if comparison.truth is None:
         return _panels_of_reference(comparison, methods)
     scale, visible = ERRORS[error][2], comparison.truth.visible
@@ -118,6 +126,7 @@ def _panels(comparison: Comparison, methods: Sequence[str], error: str) -> list[
             beliefs={m: np.where(visible[n], e.class_probability[n], np.nan) for m, e in drawn.items()},
         )
         for n, label in enumerate(comparison.labels)
+        if objects is None or label in objects
     ]
 
 

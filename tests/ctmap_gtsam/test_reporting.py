@@ -210,6 +210,16 @@ def test_the_pair_shown_is_filter_and_smoother(outcomes):
     assert shown_methods({"detector": outcomes["detector"]}) == []
 
 
+def test_figures_draw_the_objects_asked_for(small, outcomes):
+    run, _ = small
+    comparison = compare(run, {n: o.estimate for n, o in outcomes.items() if o.estimate is not None})
+    one = comparison.labels[-1:]
+    for draw in (plot.error_over_time, plot.belief_over_time):
+        assert len(draw(comparison, ["smooth-ct"]).axes) == len(comparison.labels) > 1
+        (panel,) = draw(comparison, ["smooth-ct"], objects=one).axes
+        assert panel.get_title(loc="left") == one[0].replace("_", " ")
+
+
 def test_figures_are_the_same_bytes_twice(small, outcomes):
     run, _ = small
     comparison = compare(run, {n: o.estimate for n, o in outcomes.items() if o.estimate is not None})
