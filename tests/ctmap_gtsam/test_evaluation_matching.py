@@ -47,11 +47,11 @@ def test_what_is_out_of_reach_is_no_pair():
 def test_a_small_thing_in_a_large_ones_reach_is_not_the_large_one():
     """Seen for longer, the table would else take the estimate of the mug that stands on it."""
     small, *_, large = sorted(SHAPES, key=lambda c: SHAPES[c].of.diameter_m)
-    between = 0.9 * 0.5 * SHAPES[large].of.diameter_m
+    between, frames = 0.9 * 0.5 * SHAPES[large].of.diameter_m, 20
     assert between > max(REACH_M, 0.5 * SHAPES[small].of.diameter_m)
-    seen = [[True] * 4, [True] + [False] * 3]
-    truth = objects(still(0), still(between), class_id=[[large] * 4, [small] * 4], visible=seen)
-    assert match(truth, objects(still(between), class_id=small), SHAPES).row.tolist() == [-1, 0]
+    classes, seen = [[large] * frames, [small] * frames], [[True] * frames, [True] + [False] * (frames - 1)]
+    truth = objects(still(0, frames), still(between, frames), class_id=classes, visible=seen)
+    assert match(truth, objects(still(between, frames), class_id=small), SHAPES).row.tolist() == [-1, 0]
 
 
 def test_a_wrong_class_at_the_right_place_is_matched():
