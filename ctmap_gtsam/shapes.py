@@ -1,7 +1,7 @@
 """A class as the estimators see it: a coarse mesh about its own centre.
 
-Estimators work with the pose of the *centre frame*, which lies in the middle of the bounding box, or on the axis of a
-continuous symmetry, so that rotation and translation are nearly independent and a symmetry axis passes through the origin.
+Estimators work with the pose of the *centre frame*, which lies in the middle of the bounding box, or nearby where all
+symmetries leave it, so that rotation and translation are nearly independent and a symmetry is a pure rotation.
 Poses leave an estimator in the catalogue's mesh frame (`Shape.to_object`).
 """
 
@@ -92,28 +92,30 @@ def _build(index: int, source: ObjectClass, faces: int) -> Shape:
     symmetry = Symmetry.of(source)
     centre = _centre(source, symmetry)
     mesh = Mesh(np.ascontiguousarray(coarse.vertices - centre), np.ascontiguousarray(coarse.faces), coarse.colours)
-    T = se3.make(np.eye(3), centre)
     return Shape(
         index=index,
         source=source,
-        T_object_centre=T,
+        T_object_centre=se3.make(np.eye(3), centre),
         mesh=mesh,
         normals=_face_normals(mesh),
-        symmetry=Symmetry(
-            discrete=se3.inverse(T) @ symmetry.discrete @ T, axes=symmetry.axes, offsets=symmetry.offsets - centre
-        ),
+        symmetry=_about(symmetry, centre),
         radius_m=float(np.sqrt((mesh.vertices**2).sum(-1).mean())),
     )
 
 
 def _centre(source: ObjectClass, symmetry: Symmetry) -> Array:
-    """The middle of the bounding box, moved onto the axis of a continuous symmetry: (3,) in the mesh frame."""
+    """The fixed point of all symmetries nearest to the middle of the bounding box: (3,) in the mesh frame."""
     vertices = source.mesh.vertices
     middle = np.asarray((vertices.min(0) + vertices.max(0)) / 2.0)
-    if symmetry.free != 1:
-        return symmetry.centre if symmetry.free else middle
-    axis, offset = symmetry.axes[0], symmetry.offsets[0]
-    return np.asarray(offset + (middle - offset) @ axis * axis)
+    return middle + _about(symmetry, middle).centre
+
+
+def _about(symmetry: Symmetry, origin: Array) -> Symmetry:
+    """The same symmetries in axes moved to an origin (3,)."""
+    T = se3.make(np.eye(3), origin)
+    return Symmetry(
+        discrete=se3.inverse(T) @ symmetry.discrete @ T, axes=symmetry.axes, offsets=symmetry.offsets - origin
+    )
 
 
 def _face_normals(mesh: Mesh) -> Array:
