@@ -18,7 +18,7 @@ from sequences.types import Frame
 
 Array = NDArray[np.float64]
 
-_CONTACTS = 64  # surface points of a neighbour that are tested for penetration
+_CONTACTS = 64  # surface points of each of two things that are tested for being inside the other
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,12 @@ class Surroundings:
             apart = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
             near = np.flatnonzero(apart < shape.reach_m + other.shape.reach_m)
             if len(near):
-                points = other.shape.surface_points(_CONTACTS)
-                inside = se3.transform(se3.inverse(T[near]) @ other.T_world_centre, points)
-                deepest[near] = np.maximum(deepest[near], penetration_depth(shape, inside))
+                # both ways: nothing of a box's surface lies inside a thing that is in the box
+                T_own_other = se3.inverse(T[near]) @ other.T_world_centre
+                theirs = se3.transform(T_own_other, other.shape.surface_points(_CONTACTS))
+                own = se3.transform(se3.inverse(T_own_other), shape.surface_points(_CONTACTS))
+                both = np.maximum(penetration_depth(shape, theirs), penetration_depth(other.shape, own))
+                deepest[near] = np.maximum(deepest[near], both)
         tolerance = model.config.context.support_tolerance_m
         return hinge_log_potential(deepest - tolerance, model.config.context.penetration_sigma_m)
 
