@@ -154,7 +154,9 @@ def _score(vertices, faces, solid, poses, camera, depth, background, parameters,
             _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
 
 
-def score_depth(mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: Array, margin_m: float) -> Scores:
+def score_depth(
+    mesh: Mesh, tile: Tile, T_camera_object: Array, parameters: tuple[float, ...], margin_m: float
+) -> Scores:
     """Render hypotheses (K, 4, 4) of one class into a tile and sum the pixels' log-likelihood ratios.
 
     Args:

@@ -196,5 +196,5 @@ def _draw_large(projected, faces, chosen, inverse_depth, face_ids):
             _put(inverse_depth, face_ids, row, u + i, min(high - first, first - low), start + wu * first, f)
             i = _index(np.int64(second))
             _put(inverse_depth, face_ids, row, u + i, min(high - second, second - low), start + wu * second, f)
-            for i in range(np.int64(first) + 2, np.int64(np.floor(max(high, -1.0))) + 1):
-                _put(inverse_depth, face_ids, row, u + _index(i), 0.0, start + wu * i, f)
+            for column in range(np.int64(first) + 2, np.int64(np.floor(max(high, -1.0))) + 1):
+                _put(inverse_depth, face_ids, row, u + _index(column), 0.0, start + wu * column, f)
