@@ -16,7 +16,7 @@ from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.rendering.protocol import Unavailable
 
-SYSTEM_PACKAGES = ("libgl1", "libusb-1.0-0", "libx11-6", "libgomp1")
+SYSTEM_PACKAGES = ("libegl1", "libgl1", "libx11-6", "libusb-1.0-0", "libudev1", "libidn2-0")
 """Debian and Ubuntu packages that `import open3d` needs"""
 
 _RAYS_AT_ONCE = 1 << 22  # 24 bytes each
