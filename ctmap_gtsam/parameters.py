@@ -52,7 +52,7 @@ class Prediction:
 
     rotation_rate: float = option(0.01, "random walk in view, rad per sqrt(s)", low=1e-6)
     translation_rate: float = option(0.002, "random walk in view, metres per sqrt(s)", low=1e-6)
-    jump_probability: float = option(1e-4, "chance a keyframe that a pose in view is elsewhere nearby", low=0.0, high=0.5)
+    jump_probability: float = option(1e-4, "chance a keyframe that a seen pose is elsewhere nearby", low=1e-15, high=0.5)
     region_radius_m: float = option(0.3, "radius of that neighbourhood, and of where a first pose may be, metres", low=0.01)
     stay_limit: float = option(0.5, "r1 of Equation 2: P(stay) after an endless absence", low=0.0, high=1.0)
     significant_period_s: float = option(10.0, "absences shorter than this can't hold a move, s", low=0.0)
@@ -93,7 +93,9 @@ class Filter:
 
     particles: int = option(300, "particles an object (the paper's M)", low=10)
     min_particles: int = option(24, "of a class that is still possible", low=1)
-    proposal_share: float = option(0.5, "particles drawn around refined modes rather than from the prediction", high=0.95)
+    proposal_share: float = option(
+        0.5, "particles drawn around refined modes rather than from the prediction", low=0.01, high=0.95
+    )
     search_every: int = option(5, "keyframes between fresh searches", low=1)
     search_share: float = option(0.25, "effort of such a search, as a share of the first one's", low=0.0, high=1.0)
 
