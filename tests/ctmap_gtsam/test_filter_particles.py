@@ -1,0 +1,224 @@
+"""Laws of the marginal particle filter: densities are those of the draws, and where all is Gaussian it is Kalman's."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctmap_gtsam.filtering.belief import Updater
+from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
+from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.frontend.observation import Observation
+from ctmap_gtsam.frontend.proposer import PoseModes
+from ctmap_gtsam.frontend.surroundings import Surroundings
+from ctmap_gtsam.model import Model
+from factors import mixture, prediction
+from sequences import se3
+from sequences.types import Detection, LocalisationNoise
+from tests.ctmap_gtsam.scenes import classes, config_of, frame_of, model_of
+from tests.factors.strategies import SYMMETRIES, random_image
+
+MUG = model_of("mug").shapes[0]
+SHAPES = {  # about the centre frame's origin, as shapes have them
+    name: replace(MUG, symmetry=replace(s, offsets=0 * s.offsets, discrete=_about_origin))
+    for name, s in SYMMETRIES.items()
+    for _about_origin in [np.where(np.arange(4) == 3, np.eye(4), s.discrete)]
+}
+each_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES.keys())
+SEEDS = st.integers(0, 2**31)
+
+
+def cloud(rng, shape, n=20, sigma=(0.05, 0.004), images=True):
+    """Weighted particles about a pose, each written as some image of itself."""
+    T = se3.retract(se3.exp(rng.normal(size=6)), rng.normal(size=(n, 6)) * np.repeat(sigma, 3))
+    if images:
+        T = np.stack([pose @ random_image(rng, shape.symmetry) for pose in T])
+    return Particles(T, mixture.normalised(rng.normal(size=n)))
+
+
+@each_shape
+@settings(max_examples=8)
+@given(SEEDS)
+def test_the_predicted_density_is_the_mixture_of_the_prediction_potential(shape, seed):
+    rng = np.random.default_rng(seed)
+    particles, spread = cloud(rng, shape), Spread(0.03, 0.003)
+    T = predict(particles, 10, spread, shape, rng)
+    T = np.stack([pose @ random_image(rng, shape.symmetry) for pose in T])
+    sigma = prediction.covariance(spread.rotation_rad**2, spread.translation_m**2, 1.0)
+    each = prediction.log_potential(particles.T_world_centre[None], T[:, None], sigma, shape.symmetry)
+    expected = mixture.log_sum(particles.log_weight + each)
+    np.testing.assert_allclose(predicted_log_density(particles, T, spread, shape), expected, atol=0.05)
+
+
+@each_shape
+def test_what_is_drawn_has_the_density_that_is_stated(shape):
+    """The mean of p / q over draws from q is the integral of p, 1, for the prediction and for proposals."""
+    rng = np.random.default_rng(1)
+    particles, spread = cloud(rng, shape), Spread(0.04, 0.004)
+    A = rng.normal(size=(3, 6, 6)) * np.repeat([0.02, 0.002], 3)[:, None]
+    proposals = Gaussians(
+        particles.T_world_centre[:3],
+        A @ A.swapaxes(-1, -2) + np.diag(np.repeat([0.03, 0.003], 3) ** 2),
+        np.log([0.2, 0.5, 0.3]),
+    )
+    n = 3000
+    T = np.concatenate([predict(particles, n, spread, shape, rng), proposals.draw(n, shape, rng)])
+    p = predicted_log_density(particles, T, spread, shape)
+    g = proposals.log_density(T, shape)
+    q = np.logaddexp(p, g) - np.log(2.0)
+    assert np.exp(p - q).mean() == pytest.approx(1.0, abs=0.05)
+    assert np.exp(g - q).mean() == pytest.approx(1.0, abs=0.05)
+
+
+def test_resampling_keeps_everyones_share():
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet(np.ones(7))
+    particles = Particles(se3.exp(rng.normal(size=(7, 6))), np.log(weights))
+    for uniform in (0.0, 0.3, 0.999):
+        picked = particles.resampled(1000, uniform)
+        counts = [(picked == T).all((1, 2)).sum() for T in particles.T_world_centre]
+        np.testing.assert_allclose(counts, 1000 * weights, atol=1.0)
+
+
+def test_the_heaviest_come_first_and_ties_in_order():
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, 0, 3] = np.arange(4)
+    particles = Particles(T, np.log([0.2, 0.3, 0.3, 0.2]))
+    np.testing.assert_array_equal(particles.best(4)[:, 0, 3], [1, 2, 0, 3])
+    assert Particles(T, np.full(4, np.log(0.25))).effective == pytest.approx(4.0)
+
+
+@dataclass
+class GaussianProposer:
+    """A proposer whose images are Gaussians about measured poses; frames without one say nothing."""
+
+    measured: dict[int, np.ndarray]
+    covariance: dict[int, np.ndarray]
+
+    def view(self, observation, box, detection, surroundings=None, share=1.0):
+        return SimpleNamespace(detection=detection, k=observation.keyframe, share=share)
+
+    def search(self, shape, view, observation, rng, share=1.0):
+        return np.zeros((0, 4, 4))
+
+    def modes(self, shape, view, starts, probe=True):
+        k = view.k
+        there = [k] if k in self.measured else []
+        n = len(there)
+        return PoseModes(
+            np.array([self.measured[i] for i in there]).reshape(n, 4, 4),
+            np.zeros(n),
+            np.zeros(n),
+            np.array([self.covariance[i] for i in there]).reshape(n, 6, 6),
+            np.zeros((n, 6, 3)),
+        )
+
+    def score(self, shape, view, T):
+        if view.k not in self.measured:
+            return np.zeros(len(T)), None
+        r = coordinates(T) - coordinates(self.measured[view.k])
+        return mixture.gaussian_log_density(r, np.linalg.inv(self.covariance[view.k])), None
+
+    def log_clutter(self, shape, view, T):
+        return 0.0
+
+
+def coordinates(T):
+    """Near the reference, poses are vectors: [rotation vector, translation]."""
+    return np.concatenate([se3.so3_log(T[..., :3, :3]), T[..., :3, 3] - REFERENCE[:3, 3]], axis=-1)
+
+
+REFERENCE = se3.make(np.eye(3), np.array([0.0, 0.0, 0.8]))
+TIMES = np.array([0.0, 0.3, 1.0, 1.2, 2.5, 2.6, 4.0])
+MISSING = (2, 5)
+SCALE = np.repeat([0.02, 0.002], 3)
+
+
+def observation_at(k, detection):
+    frame = frame_of(k, np.eye(4), np.zeros((240, 320), np.float32), [detection], time_s=TIMES[k])
+    return Observation(k, frame, frame.read_depth(), ())
+
+
+@pytest.mark.parametrize("share", [0.5, 0.01], ids=["half proposed", "almost all predicted"])
+def test_where_all_is_gaussian_the_filter_is_kalmans(share):
+    """Law 7 of the model: means, covariances, evidence; irregular times, missing measurements, random covariances."""
+    rng = np.random.default_rng(5)
+    n = 3000
+    config = config_of(
+        f"filter.particles={n}",
+        f"filter.proposal_share={share}",
+        "prediction.rotation_rate=0.02",
+        "prediction.translation_rate=0.002",
+        "prediction.jump_probability=1e-12",
+    )
+    model = Model(classes("mug"), config, context=False)
+    measured, covariance = {}, {}
+    for k in range(len(TIMES)):
+        if k not in MISSING:
+            A = rng.normal(size=(6, 6)) / np.sqrt(6)
+            covariance[k] = (A @ A.T + 2.0 * np.eye(6)) * SCALE[:, None] * SCALE
+            xi = rng.normal(size=6) * SCALE
+            measured[k] = se3.make(se3.so3_exp(xi[:3]), REFERENCE[:3, 3] + xi[3:])
+    updater = Updater(model, GaussianProposer(measured, covariance), LocalisationNoise())
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    track = Track(0, (0,), (detection,), 0)
+    mean, P, evidence = coordinates(measured[0]), covariance[0], model.log_uniform(model.shapes[0])
+    belief = updater.start(track, observation_at(0, detection), Surroundings((), ()))
+    few = np.sqrt(n)
+    for k in range(len(TIMES)):
+        if k:
+            belief = updater.step(belief, detection, observation_at(k, detection), Surroundings((), ()))
+            P = P + model.prediction_covariance(TIMES[k] - TIMES[k - 1])
+        if k and k not in MISSING:
+            S = P + covariance[k]
+            r = coordinates(measured[k]) - mean
+            evidence += mixture.gaussian_log_density(r, np.linalg.inv(S))
+            gain = P @ np.linalg.inv(S)
+            mean, P = mean + gain @ r, P - gain @ P
+        own = belief.classes[0]
+        x, w = coordinates(own.particles.T_world_centre), np.exp(own.particles.log_weight)
+        sigma = np.sqrt(np.diag(P))
+        found = w @ x
+        spread = (w[:, None] * (x - found)).T @ (x - found)
+        few = min(few, np.sqrt(own.particles.effective))  # what was once lost stays lost
+        np.testing.assert_allclose((found - mean) / sigma, 0.0, atol=5.0 / few)
+        np.testing.assert_allclose(spread / np.outer(sigma, sigma), P / np.outer(sigma, sigma), atol=8.0 / few)
+        assert own.log_evidence == pytest.approx(evidence, abs=0.1 * (k + 1))
+    assert few > 15.0
+
+
+def test_a_measurement_in_the_tail_of_the_prediction_is_met_half_way():
+    """Seven sigma away, where hardly a particle is predicted: proposals reach it, and the prediction weighs them."""
+    model = Model(
+        classes("mug"), config_of("filter.particles=2000", "prediction.jump_probability=1e-12"), context=False
+    )
+    away = 5.0 * SCALE[3]
+    far = se3.make(np.eye(3), REFERENCE[:3, 3] + [away, 0.0, 0.0])
+    covariance = {k: np.diag(SCALE**2) for k in (0, 1)}
+    updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise())
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    nothing = Surroundings((), ())
+    belief = updater.start(Track(0, (0,), (detection,), 0), observation_at(0, detection), nothing)
+    belief = updater.step(belief, detection, observation_at(1, detection), nothing)
+    prior = SCALE[3] ** 2 + model.prediction_covariance(0.3)[3, 3]
+    particles = belief.classes[0].particles
+    x = np.exp(particles.log_weight) @ particles.T_world_centre[:, 0, 3]
+    assert x == pytest.approx(away * prior / (prior + SCALE[3] ** 2), abs=0.001)
+
+
+@pytest.mark.parametrize("jump", [1e-12, 0.01])
+def test_a_thing_that_jumped_is_found_as_likely_as_the_prior_says(jump):
+    model = Model(classes("mug"), config_of(f"prediction.jump_probability={jump}"), context=False)
+    far = se3.make(np.eye(3), REFERENCE[:3, 3] + [0.1, 0.0, 0.0])
+    covariance = {k: np.diag(SCALE**2) for k in (0, 1)}
+    updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise())
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    nothing = Surroundings((), ())
+    start = updater.start(Track(0, (0,), (detection,), 0), observation_at(0, detection), nothing)
+    after = updater.step(start, detection, observation_at(1, detection), nothing)
+    gained = after.classes[0].log_evidence - start.classes[0].log_evidence
+    assert gained == pytest.approx(np.log(jump) + model.log_uniform(model.shapes[0]), abs=0.3)
+    assert after.classes[0].particles.best(1)[0, 0, 3] == pytest.approx(0.1, abs=0.01)
