@@ -11,7 +11,7 @@ from scipy.ndimage import find_objects
 
 from sequences import se3
 from sequences.camera import Camera
-from sequences.catalogue import Mesh
+from sequences.catalogue import Catalogue, Mesh
 from sequences.progress import SILENT, Progress, Stage
 from sequences.rendering.scene import SceneImages, render_scene
 from sequences.seeds import generator
@@ -49,7 +49,7 @@ def simulate_place(out: Path, config: SimulationConfig, seed: int, progress: Pro
     """
     place = furnish(config.place, seed)
     arrangements = arrange(place, config.place, config.motion, seed)
-    classes = catalogue(place.shapes)
+    classes = _known_classes(place, config)
     with (
         RunWriter(out, classes, source=SOURCE, up_world=UP, localisation=config.localisation.noise) as writer,
         progress.stage("simulate", total=len(arrangements) * config.trajectory.frames) as stage,
@@ -67,14 +67,14 @@ def _simulate_visit(
     visit: int,
     stage: Stage,
 ) -> None:
-    camera, classes = config.sensor.camera, catalogue(place.shapes)
-    placed = (*arrangement.things, *place.furniture)
-    items = [(p.shape.object_class.mesh, p.T_world_object) for p in placed]
+    camera, classes = config.sensor.camera, _known_classes(place, config)
+    placed = (*arrangement.things, *place.furniture) if config.place.known_furniture else arrangement.things
+    items = [(p.shape.object_class.mesh, p.T_world_object) for p in (*arrangement.things, *place.furniture)]
     scene = light([*items, (place.room, np.eye(4))], np.array(LAMP_M) * (place.side, 1.0, 1.0))
     times, T_world_camera = camera_path(place, config.trajectory, seed, visit)
     rng = generator(seed, "simulation.localisation", keyframe=visit)
     recorded = recorded_poses(T_world_camera, times, config.localisation.noise, rng)
-    bias = _object_bias(placed, config.sensor, seed, visit)
+    bias = _object_bias(placed, len(scene.items), config.sensor, seed, visit)
     things = {p.inst_id: p.shape.object_class.obj_id for p in placed}
     detector = Detector(classes, (camera.width, camera.height), config.detector, seed, visit, things, len(times))
     for k, T in enumerate(T_world_camera):
@@ -100,10 +100,17 @@ def _simulate_visit(
         stage.advance()
 
 
-def _object_bias(placed: Sequence[Placed], config: SensorConfig, seed: int, visit: int) -> Array:
-    """(n + 2,) depth error of each thing, metres; 0 for the room and, at -1, for where nothing is."""
-    draws = [generator(seed, "simulation.bias", p.inst_id, visit).standard_normal() for p in placed]
-    return np.array([*(config.object_bias_m * np.array(draws)), 0.0, 0.0])
+def _known_classes(place: Place, config: SimulationConfig) -> Catalogue:
+    """The catalogue of the run: furniture may be something that nobody modelled."""
+    return catalogue(tuple(s for s in place.shapes if config.place.known_furniture or s.object_class.movable))
+
+
+def _object_bias(placed: Sequence[Placed], items: int, config: SensorConfig, seed: int, visit: int) -> Array:
+    """(items + 1,) depth error of each thing, metres; 0 for what has no mesh and, at -1, for where nothing is."""
+    bias = np.zeros(items + 1)
+    for i, p in enumerate(placed):
+        bias[i] = config.object_bias_m * generator(seed, "simulation.bias", p.inst_id, visit).standard_normal()
+    return bias
 
 
 def _look(
