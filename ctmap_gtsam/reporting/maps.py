@@ -86,12 +86,12 @@ def _blend(image: Image8, shaded: Image8, scene: SceneImages, depth: NDArray[np.
 
 def _outline(image: Image8, scene: SceneImages, colours: list[RGB]) -> Image8:
     """A line of the class's colour, with a white one outside it that keeps it apart from the picture."""
-    out = image.copy()
+    out, width = image.copy(), max(1, round(image.shape[0] / 240))
     for k, colour in enumerate(colours):
         mask = (scene.item == k).astype(np.uint8)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(out, contours, -1, (255, 255, 255), 4, cv2.LINE_AA)
-        cv2.drawContours(out, contours, -1, colour, 2, cv2.LINE_AA)
+        cv2.drawContours(out, contours, -1, (255, 255, 255), 2 * width, cv2.LINE_AA)
+        cv2.drawContours(out, contours, -1, colour, width, cv2.LINE_AA)
     return out
 
 

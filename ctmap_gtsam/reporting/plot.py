@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from ctmap_gtsam.evaluation.comparison import Comparison
@@ -159,6 +159,8 @@ def _grid(comparison: Comparison, panels: Sequence[_Panel]) -> tuple[Figure, lis
         ax.set_xlabel("seconds" if _one_visit(comparison) else "frame; dashed: a new visit")
         margin = 0.015 * max(time[-1] - time[0], 1e-3)
         ax.set_xlim(time[0] - margin, time[-1] + margin)
+        if not _one_visit(comparison):
+            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         for f in [] if _one_visit(comparison) else np.flatnonzero(np.diff(comparison.visit)):
             ax.axvline(f + 0.5, color=QUIET, linestyle=(0, (4, 3)), linewidth=1)
     return figure, axes
@@ -202,7 +204,8 @@ def _draw_errors(ax: Axes, comparison: Comparison, panel: _Panel, methods: Seque
         _line(ax, comparison, np.where(np.isfinite(values), np.maximum(values, low), values), method, methods)
     if top > high:
         ax.axhspan(high, top, color="#f3f0ec", zorder=0)
-        ax.text(0.995, 0.985, "no answer, or another class", transform=ax.transAxes, ha="right", va="top", fontsize=8)
+        said = "× no answer, or another class"
+        ax.text(1.0, 1.02, said, transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color="#50565e")
         for k, (method, where) in enumerate(missing.items()):
             row = high * (top / high) ** ((len(missing) - k - 0.5) / len(missing))
             colour = _LINES[list(methods).index(method) % len(_LINES)]
