@@ -153,8 +153,7 @@ def right_jacobian(xi: Array) -> Array:
 
 def right_jacobian_inverse(xi: Array) -> Array:
     """(..., 6) -> (..., 6, 6): log(exp(xi) exp(d)) ~ xi + J_r^-1(xi) d."""
-    inverse: Array = np.linalg.inv(right_jacobian(xi))
-    return inverse
+    return np.linalg.inv(right_jacobian(xi)).astype(np.float64, copy=False)
 
 
 def _left_jacobian(xi: Array) -> Array:
