@@ -1,0 +1,235 @@
+"""Laws of the trellis, against all paths enumerated, GTSAM's discrete elimination, and exact integrals."""
+
+from dataclasses import replace
+from itertools import pairwise, product
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.smoothing.discrete import PRESENT_AT_FIRST, Stage, solve
+from factors import mixture, prediction
+from factors.mixture import LOG_2PI
+from factors.persistence import stay_probability
+from sequences import se3
+from tests.ctmap_gtsam.scenes import classes, config_of
+
+MODEL = Model(classes("mug"), config_of("prediction.rotation_rate=0.2", "prediction.translation_rate=0.05"))
+MUG = MODEL.shapes[0]
+USUAL = Model(classes("mug"), config_of())
+STILL = np.full(6, 1e-18)
+"""localisation without error"""
+SMALL = 1e-8
+"""variance of modes that are so precise that what is known of the past is the last mode alone: a Markov chain"""
+
+
+def random_stages(rng, sizes, gaps=(0.2, 1.0, 40.0)):
+    """Stages of precise modes within a decimetre."""
+    time, stages = 0.0, []
+    for k, n in enumerate(sizes):
+        T = se3.exp(rng.normal(size=(n, 6)) * np.repeat([0.2, 0.05], 3))
+        # about as likely as not being there: the modes' volume and the place's are made up for
+        nats = 3.0 * rng.normal(size=n) + 49.0
+        stages.append(Stage(k, time, T, np.tile(SMALL * np.eye(6), (n, 1, 1)), nats))
+        time += rng.choice(gaps)
+    return stages
+
+
+def log_steps(stages, model, shape):
+    """Start (n + 1,), emissions and transitions in the model's words, the last state being gone; and stays apart."""
+    uniform = model.log_uniform(shape)
+    emissions = [
+        np.append(s.log_evidence + 0.5 * (np.linalg.slogdet(s.covariance)[1] + 6 * LOG_2PI), 0.0) for s in stages
+    ]
+    start = np.append(np.full(len(stages[0].log_evidence), np.log(PRESENT_AT_FIRST) + uniform), np.log(0.5))
+    steps, stays = [], []
+    p = model.config.prediction
+    for a, b in pairwise(stages):
+        n, m = len(a.log_evidence), len(b.log_evidence)
+        dt = b.time_s - a.time_s
+        stay = 1.0
+        if dt > p.significant_period_s:
+            stay = float(stay_probability(dt, shape.source.persistence_s, p.stay_limit, 1.0 - p.stay_limit))
+        stay = min(stay, 1.0 - p.jump_probability)
+        sigma = model.prediction_covariance(min(dt, p.significant_period_s))
+        there = np.full((n, m), -np.inf)
+        for i, j in product(range(n), range(m)):
+            there[i, j] = np.log(stay) + prediction.log_potential(a.T_world_centre[i], b.T_world_centre[j], sigma)
+        elsewhere = np.log((1.0 - stay) / 2.0)
+        step = np.full((n + 1, m + 1), elsewhere + uniform)
+        step[:n, :m] = np.logaddexp(there, elsewhere + uniform)
+        step[:n, m] = elsewhere
+        step[n, m] = np.log1p(-np.exp(elsewhere))
+        steps.append(step)
+        stays.append(there)
+    return start, emissions, steps, stays
+
+
+def all_paths(start, emissions, steps):
+    """Every path with its log weight."""
+    for path in product(*(range(len(e)) for e in emissions)):
+        weight = start[path[0]] + sum(e[s] for e, s in zip(emissions, path, strict=True))
+        yield path, weight + sum(step[a, b] for step, a, b in zip(steps, path, path[1:], strict=False))
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 2**31), st.lists(st.integers(0, 3), min_size=1, max_size=4))
+def test_the_trellis_sums_over_all_paths(seed, sizes):
+    rng = np.random.default_rng(seed)
+    stages = random_stages(rng, sizes)
+    start, emissions, steps, stays = log_steps(stages, MODEL, MUG)
+    paths, weights = zip(*all_paths(start, emissions, steps), strict=True)
+    total = mixture.log_sum(np.array(weights))
+    posterior = solve(stages, MODEL, MUG, STILL)
+    assert posterior.log_evidence == pytest.approx(total, abs=1e-3)
+    share = np.exp(np.array(weights) - total)
+    for k, marginal in enumerate(posterior.modes):
+        expected = np.bincount([p[k] for p in paths], share, minlength=len(marginal))
+        np.testing.assert_allclose(marginal, expected, atol=1e-3)
+    ordered = np.sort(weights)
+    if len(ordered) == 1 or ordered[-1] - ordered[-2] > 1e-2:
+        assert posterior.path == paths[int(np.argmax(weights))]
+    for k, (step, stay) in enumerate(zip(steps, stays, strict=True)):
+        n, m = stay.shape
+        either = sum(w for p, w in zip(paths, share, strict=True) if p[k] < n or p[k + 1] < m)
+        stayed = sum(
+            w * np.exp(stay[p[k], p[k + 1]] - step[p[k], p[k + 1]])
+            for p, w in zip(paths, share, strict=True)
+            if p[k] < n and p[k + 1] < m
+        )
+        if either > 1e-6:
+            assert posterior.moved[k] == pytest.approx(1.0 - stayed / either, abs=2e-3)
+
+
+def test_marginals_and_best_path_are_those_of_gtsam():
+    rng = np.random.default_rng(4)
+    stages = random_stages(rng, (2, 3, 1, 0, 2, 3))
+    start, emissions, steps, _ = log_steps(stages, MODEL, MUG)
+    # GTSAM has no variable with a single value: a stage without modes gets a second state of no weight
+    pad = [max(2 - len(e), 0) for e in emissions]
+    graph, keys = (
+        gtsam.DiscreteFactorGraph(),
+        [(k, len(e) + p) for k, (e, p) in enumerate(zip(emissions, pad, strict=True))],
+    )
+
+    def table(logs):
+        return list(np.exp(logs - logs.max()).ravel())
+
+    graph.add(keys[0], table(start))
+    for key, emission, p in zip(keys, emissions, pad, strict=True):
+        graph.add(key, table(np.append(emission, np.full(p, -np.inf))))
+    for a, b, step, p, q in zip(keys, keys[1:], steps, pad, pad[1:], strict=False):
+        graph.add([a, b], table(np.pad(step, ((0, p), (0, q)), constant_values=-np.inf)))
+    marginals, best = gtsam.DiscreteMarginals(graph), graph.optimize()
+    posterior = solve(stages, MODEL, MUG, STILL)
+    for key, marginal in zip(keys, posterior.modes, strict=True):
+        expected = marginals.marginalProbabilities(key)[: len(marginal)]
+        np.testing.assert_allclose(marginal, expected, atol=1e-3)
+    assert posterior.path == tuple(best[k] for k, _ in keys)
+
+
+def vague_track(rng, n, sigma=0.004):
+    """One vague mode a stage of a thing that stands still: translations with random covariances."""
+    stages = []
+    for k in range(n):
+        A = rng.normal(size=(3, 3)) / np.sqrt(3)
+        covariance = np.diag(np.full(6, 1e-10))
+        covariance[3:, 3:] = sigma**2 * (A @ A.T + 0.3 * np.eye(3))
+        T = se3.make(np.eye(3), rng.multivariate_normal(np.zeros(3), covariance[3:, 3:]))
+        stages.append(Stage(k, 0.5 * k + 0.1 * rng.random(), T[None], covariance[None], np.array([60.0])))
+    return stages
+
+
+def test_evidence_of_a_track_is_the_integral_over_its_poses():
+    """Law 7 of the model: with one mode a stage it is Kalman's evidence, however vague the single views are."""
+    config = config_of("prediction.rotation_rate=1e-6", "prediction.jump_probability=1e-15")
+    model = Model(classes("mug"), config)
+    rng = np.random.default_rng(2)
+    stages, shape = vague_track(rng, 9), model.shapes[0]
+    # information form over all poses at once: the first anywhere, then a random walk
+    n = len(stages)
+    information, vector, constant = np.zeros((6 * n, 6 * n)), np.zeros(6 * n), 0.0
+    for k, stage in enumerate(stages):
+        here = slice(6 * k, 6 * k + 6)
+        L, z = np.linalg.inv(stage.covariance[0]), se3.log(stage.T_world_centre[0])
+        information[here, here] += L
+        vector[here] += L @ z
+        constant += stage.log_evidence[0] - 0.5 * z @ L @ z
+        if k:
+            Q = model.prediction_covariance(stage.time_s - stages[k - 1].time_s)
+            D = np.kron(np.eye(n)[k] - np.eye(n)[k - 1], np.eye(6))
+            information += D.T @ np.linalg.inv(Q) @ D
+            constant -= 0.5 * (np.linalg.slogdet(Q)[1] + 6 * LOG_2PI)
+    mean = np.linalg.solve(information, vector)
+    integral = constant + 0.5 * vector @ mean + 0.5 * (6 * n * LOG_2PI - np.linalg.slogdet(information)[1])
+    expected = np.log(PRESENT_AT_FIRST) + model.log_uniform(shape) + integral
+    posterior = solve(stages, model, shape, STILL)
+    assert posterior.log_evidence == pytest.approx(expected, abs=1e-4)
+    assert all(m[0] > 1 - 1e-9 for m in posterior.modes)
+    assert (posterior.moved < 1e-9).all()
+
+
+def test_more_views_of_one_thing_are_more_evidence_for_it_and_not_less():
+    rng = np.random.default_rng(3)
+    stages = vague_track(rng, 12)
+    grown = [solve(stages[:n], MODEL, MUG, STILL).log_evidence for n in range(1, 13)]
+    assert (np.diff(grown) > 0).all()
+
+
+def test_a_wide_mode_doesnt_win_for_being_wide_only():
+    """Two modes of one height: the shares are those of their volumes. At equal mass they are equal."""
+    covariance = np.stack([1e-4 * np.eye(6), 4e-4 * np.eye(6)])
+    volumes = np.array([0.0, 6 * np.log(2.0)])
+    T = np.tile(np.eye(4), (2, 1, 1))
+    alike = solve([Stage(0, 0.0, T, covariance, 80.0 - volumes)], MODEL, MUG, STILL).modes[0]
+    high = solve([Stage(0, 0.0, T, covariance, np.full(2, 80.0))], MODEL, MUG, STILL).modes[0]
+    assert alike[0] == pytest.approx(alike[1])
+    assert high[1] / high[0] == pytest.approx(2.0**6)
+
+
+def at(k, time, x, nats=45.0):
+    return Stage(
+        k,
+        time,
+        se3.make(np.eye(3), np.array([[x, 0.0, 0.0]])),
+        np.diag(np.repeat([1e-4, 1e-6], 3))[None],
+        np.array([nats]),
+    )
+
+
+def test_when_it_was_moved_is_told_from_when_it_was_gone():
+    """Present, gone from view for a day, seen elsewhere: it was moved in the gap and at no other time."""
+    day = 86400.0
+    stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), at(2, day, 0.25), at(3, day + 1.0, 0.25)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0, 0, 0, 0)
+    assert posterior.moved[1] > 0.99
+    assert (posterior.moved[[0, 2]] < 0.01).all()
+    still = solve([at(k, t, 0.0) for k, t in enumerate((0.0, 1.0, day, day + 1.0))], USUAL, MUG, STILL)
+    assert (still.moved < 0.01).all()
+
+
+def test_a_place_seen_empty_says_from_when_on_it_was_gone():
+    empty = -60.0  # a pose that should show and doesn't
+    stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), at(2, 86400.0, 0.0, empty), at(3, 86401.0, 0.0, empty)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0, 0, 1, 1)
+    assert [m[-1] > 0.99 for m in posterior.modes] == [False, False, True, True]
+
+
+def test_a_moment_hidden_is_not_an_absence():
+    """A view that says nothing either way leaves it where it was."""
+    flat = Stage(2, 2.0, np.eye(4)[None], np.diag(np.repeat([1e-4, 1e-6], 3))[None], np.zeros(1))
+    stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), flat, at(3, 3.0, 0.0), at(4, 4.0, 0.0)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0, 0, 0, 0, 0)
+    assert posterior.modes[2][0] > 0.99
+
+
+def test_an_object_that_cant_be_moved_stays_however_long_nobody_looks():
+    fixed = replace(MUG, source=replace(MUG.source, movable=False))
+    stages = [at(0, 0.0, 0.0), at(1, 1e7, 0.2)]
+    assert solve(stages, USUAL, MUG, STILL).log_evidence > solve(stages, USUAL, fixed, STILL).log_evidence + 1.0
