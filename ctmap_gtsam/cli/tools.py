@@ -63,6 +63,6 @@ def bench(
     with RichProgress() as progress:
         result = run_bench(name, settings(config_file, assignments, seed), progress)
     for figure, value in result["figures"].items():
-        typer.echo(f"{figure} {value:.6g}")
+        typer.echo(f"{figure} {value:.6g}" if isinstance(value, float) else f"{figure} {value}")
     if json_file is not None:
         write_json(json_file, result)

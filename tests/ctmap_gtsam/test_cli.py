@@ -113,6 +113,17 @@ def test_an_unknown_measurement_names_those_there_are() -> None:
     assert_clean_error(ctmap("bench", "nothing"), "render")
 
 
+def test_a_measurement_prints_what_it_writes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    figures = {"a.per_s": 1.25, "b.per_s": None, "b.skipped": "a library is missing"}
+    monkeypatch.setattr("ctmap_gtsam.bench.render.run", lambda *_: figures)
+    result = ctmap("bench", "render", "--json", tmp_path / "render.json")
+    assert result.stdout.splitlines() == ["a.per_s 1.25", "b.per_s None", "b.skipped a library is missing"]
+    written = json.loads((tmp_path / "render.json").read_text())
+    assert written["figures"] == figures
+    assert written["seconds"] >= 0
+    assert "numpy" in written["versions"]
+
+
 def test_a_file_that_cannot_be_written_is_one_clean_error(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("in the way")
