@@ -30,8 +30,8 @@ from sequences.catalogue import Mesh
 from sequences.rendering.kernels import NEAR_M
 from sequences.rendering.protocol import Unavailable
 
-SYSTEM_PACKAGES = ("libegl1", "libgl1")
-"""Debian and Ubuntu packages that it needs (software rendering comes with libegl1, as libgl1-mesa-dri)"""
+SYSTEM_PACKAGES = ("libegl1", "libgl1", "libxrender1")
+"""Debian and Ubuntu packages that it needs (libxrender1 for its pyglet; software rendering comes with libegl1)"""
 
 _LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6")}
 
