@@ -241,7 +241,7 @@ def _shortest(A: Array, B: Array, symmetry: Symmetry, information: ArrayLike | N
         metric = np.asarray(information, dtype=np.float64)
         if metric.ndim > 2:
             metric = np.broadcast_to(metric, (*batch, 6, 6))
-        metric = np.ascontiguousarray(metric).reshape(-1, 6, 6)
+        metric = np.array(metric, order="C").reshape(-1, 6, 6)  # a copy, for the same reason as in _pairs
     r, g, chosen = np.empty((*batch, 6)), np.empty((*batch, 4, 4)), np.empty(batch, dtype=np.int64)
     shortest(
         _flat(A),

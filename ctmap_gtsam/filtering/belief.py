@@ -76,6 +76,8 @@ class Reported:
 
     class_probability: Array
     """(C,)"""
+    log_evidence: float
+    """of all classes together, nats"""
     existence: float
     visible: bool
     modes: tuple[tuple[int, float, Array, Array, Array], ...]
@@ -211,7 +213,7 @@ class Updater:
             "class": float((belief.score_evidence + self.model.class_evidence(belief.score_sum))[best]),
             "context": float(context[best]),
         }
-        return Reported(probability, float(existence), belief.visible, tuple(modes), ledger)
+        return Reported(probability, there, float(existence), belief.visible, tuple(modes), ledger)
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""

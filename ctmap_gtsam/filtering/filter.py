@@ -110,7 +110,7 @@ class _State:
     def _neighbours(self, reports: Mapping[int, Reported]) -> tuple[Neighbour, ...]:
         """Objects that are sure of themselves, by their most likely particle."""
         return tuple(
-            Neighbour(i, self.model.shapes[r.best_class], r.best_pose)
+            Neighbour(i, self.model.shapes[r.best_class], r.best_pose, r.log_evidence)
             for i, r in sorted(reports.items())
             if r.best_pose is not None
             and r.existence > NEIGHBOUR_PROBABILITY

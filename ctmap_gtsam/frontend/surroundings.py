@@ -18,6 +18,7 @@ from sequences.types import Frame
 
 Array = NDArray[np.float64]
 
+_CONTENTION_M = 0.012  # things that reach deeper into each other are rivals for one place
 _CONTACTS = 64  # surface points of each of two things that are tested for being inside the other
 
 
@@ -29,6 +30,27 @@ class Neighbour:
     shape: Shape
     T_world_centre: Array
     """(4, 4)"""
+    log_evidence: float
+    """of its being there, nats"""
+
+    def yields_to(self, other: Neighbour) -> bool:
+        """Whether both claim the same space and the other has more evidence: the pixels there are then the other's alone."""
+        stronger = (other.log_evidence, -other.object_id) > (self.log_evidence, -self.object_id)
+        return stronger and self._contends(other)
+
+    def _contends(self, other: Neighbour) -> bool:
+        apart = np.linalg.norm(self.T_world_centre[:3, 3] - other.T_world_centre[:3, 3])
+        if apart > self.shape.reach_m + other.shape.reach_m:
+            return False
+        # two of one form in one pose touch everywhere and reach into each other nowhere
+        if apart < 0.5 * min(self.shape.radius_m, other.shape.radius_m):
+            return True
+        return any(
+            penetration_depth(a.shape, se3.transform(se3.inverse(a.T_world_centre) @ b.T_world_centre, points))[()]
+            > _CONTENTION_M
+            for a, b in ((self, other), (other, self))
+            for points in (b.shape.surface_points(_CONTACTS)[None],)
+        )
 
 
 @dataclass(frozen=True)
@@ -40,8 +62,10 @@ class Surroundings:
     """level surfaces, world frame; empty where up is unknown"""
 
     def without(self, object_id: int) -> Surroundings:
-        """The same for one object: it is not its own neighbour."""
-        return replace(self, neighbours=tuple(n for n in self.neighbours if n.object_id != object_id))
+        """The same for one object: it is not its own neighbour, nor are those that yield to it."""
+        own = next((n for n in self.neighbours if n.object_id == object_id), None)
+        others = (n for n in self.neighbours if n.object_id != object_id)
+        return replace(self, neighbours=tuple(n for n in others if own is None or not n.yields_to(own)))
 
     def beneath(self, tile: Tile, frame: Frame) -> Tile:
         """The tile with known surfaces as background where this image alone shows none."""

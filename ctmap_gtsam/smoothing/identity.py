@@ -1,12 +1,14 @@
-"""Which tracks are one object: what left one place and what came to another may be the same thing, moved.
+"""Which tracks are one object.
 
-An object that is gone from some keyframe on and one of the same class that was not there before are joined by a global
-assignment of what vanished to what appeared.
+Two of one class in one place are one thing, seen on two tracks. And what left one place and what came to another may be
+the same thing, moved: an object that is gone from some keyframe on and one of the same class that was not there before are
+joined by a global assignment of what vanished to what appeared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -15,7 +17,36 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.modes import Recording
 
+_ONE_PLACE = 0.5  # of a thing's radius: solid things of one class can't have centres so near
 _SAME_CLASS = 0.5  # least P(both are of one class) for a join
+
+
+def merge_duplicates(things: Mapping[int, Thing], model: Model) -> dict[int, Thing]:
+    """Of things of one class in one place, present at one time, the one with most evidence takes the others' tracks."""
+    kept: list[Thing] = []
+    for thing in sorted(things.values(), key=lambda t: (-t.log_evidence, t.object_id)):
+        twin = next((i for i, other in enumerate(kept) if _same(other, thing, model)), None)
+        if twin is None:
+            kept.append(thing)
+        else:
+            kept[twin] = replace(kept[twin], tracks=(*kept[twin].tracks, *thing.tracks))
+    return {thing.object_id: thing for thing in sorted(kept, key=lambda t: t.object_id)}
+
+
+def _same(a: Thing, b: Thing, model: Model) -> bool:
+    if not (a.exists and b.exists) or a.best_class != b.best_class:
+        return False
+    shared = {k for k, p in zip(a.keyframes, a.presence, strict=True) if p > 0.5} & {
+        k for k, p in zip(b.keyframes, b.presence, strict=True) if p > 0.5
+    }
+    if not shared:
+        return False
+    k = sorted(shared)[len(shared) // 2]
+    T_a, T_b = a.pose_near(a.best_class, k), b.pose_near(b.best_class, k)
+    if T_a is None or T_b is None:
+        return False
+    apart = np.linalg.norm(T_a[0, :3, 3] - T_b[0, :3, 3])
+    return bool(apart < _ONE_PLACE * model.shapes[a.best_class].radius_m)
 
 
 def join_moved(things: Mapping[int, Thing], recording: Recording, model: Model) -> dict[int, Thing]:

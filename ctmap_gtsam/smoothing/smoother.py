@@ -17,11 +17,11 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.proposer import Proposer
-from ctmap_gtsam.frontend.surroundings import Neighbour
+from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.belief import LIKELY, POSSIBLE, Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera, Smoothed, build, smooth
-from ctmap_gtsam.smoothing.identity import join_moved
+from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Found, Recording, Sighting, Wanted, gather, in_world, record, seed
 from ctmap_gtsam.smoothing.writing import write
 from factors.symmetry import residual
@@ -116,26 +116,19 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
         return Wanted(starts, (best, pose[0]), frozenset(thing.likely()))
 
     def neighbours(i: int, k: int) -> tuple[Neighbour, ...]:
-        return tuple(
-            Neighbour(j, model.shapes[other.best_class], pose)
-            for j, other in current.things.items()
-            if j != i
-            and (pose := other.present_pose(k)) is not None
-            and not _claims_first(current.things[i], other, model)
-        )
+        there = [_neighbour(thing, k, model) for thing in current.things.values()]
+        return Surroundings(tuple(n for n in there if n is not None), ()).without(i).neighbours
 
     sightings = gather(recording, proposer, wanted, tracks, neighbours, progress, name)
     return _solve(recording, model, tracks, sightings)
 
 
-def _claims_first(thing: Thing, other: Thing, model: Model) -> bool:
-    """Two objects in one place contend for the same pixels: the one with more evidence has them first."""
-    a, b = thing.anchor, other.anchor
-    if a is None or b is None:
-        return False
-    within = 0.5 * min(model.shapes[thing.best_class].radius_m, model.shapes[other.best_class].radius_m)
-    same_place = np.linalg.norm(a[:3, 3] - b[:3, 3]) < within
-    return bool(same_place and (thing.log_evidence, -thing.object_id) > (other.log_evidence, -other.object_id))
+def _neighbour(thing: Thing, keyframe: int, model: Model) -> Neighbour | None:
+    """An object that is surely there at a keyframe."""
+    pose = thing.present_pose(keyframe)
+    if pose is None:
+        return None
+    return Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.log_evidence)
 
 
 def _solve(
@@ -148,7 +141,7 @@ def _solve(
     things = {
         i: judge(i, tracks[i], sightings[i], recording, model) for i in tracks if sightings[i]
     }
-    things = join_moved(things, recording, model)
+    things = join_moved(merge_duplicates(things, model), recording, model)
     cameras = [
         Camera(recording.T_world_camera(k), recording.time_s(k), recording.run.frames[int(f)].visit)
         for k, f in enumerate(recording.keyframes)
