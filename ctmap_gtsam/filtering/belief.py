@@ -249,7 +249,7 @@ class Updater:
         """After a significant absence the object stayed with S(dt) (Equation 3), or is where nobody has looked."""
         gap = (observation.frame.time_ns - belief.time_ns) * 1e-9
         settings = self.model.config.prediction
-        if belief.visible or gap < settings.significant_period_s:
+        if gap < settings.significant_period_s:
             return belief
         total = belief.class_log_evidence(self.model)
         r1 = settings.stay_limit

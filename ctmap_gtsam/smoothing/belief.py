@@ -41,6 +41,8 @@ class Thing:
     """class index -> what its trellis says"""
     class_log_evidence: Array
     """(C,) depth, boxes, context, scores and prior"""
+    score_evidence: Array
+    """(C,) the scores' part of it"""
     log_clutter: float
     """log evidence of something that no mesh explains, at the same keyframes"""
     poses: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
@@ -83,7 +85,7 @@ class Thing:
         posterior = self.posteriors.get(self.best_class)
         if posterior is None:
             return np.zeros(len(self.keyframes))
-        return np.array([1.0 - m[-1] for m in posterior.modes])
+        return np.clip([1.0 - m[-1] for m in posterior.modes], 0.0, 1.0)
 
     @property
     def anchor(self) -> Array | None:
@@ -212,6 +214,7 @@ def judge(
         stages,
         posteriors,
         evidence + scores - np.log(len(model.shapes)),
+        scores,
         clutter,
     )
 

@@ -172,7 +172,9 @@ def _update(known: _Known, b: Stage, between: _Between, log_joint: Array, shape:
 def _moved(step: _Step, forward: Array, ahead: Array, total: float) -> float:
     joint = forward[:, None] + step.log_total + ahead
     there = float(np.exp(log_sum(joint.ravel()) - total)) - float(np.exp(joint[-1, -1] - total))
-    if there < 1e-12 or not step.log_stay.size:
+    if there < 1e-9:  # it was gone before and after
+        return 0.0
+    if not step.log_stay.size:
         return 1.0
     stayed = float(np.exp(log_sum((forward[:-1, None] + step.log_stay + ahead[:-1]).ravel()) - total))
     return float(np.clip(1.0 - stayed / there, 0.0, 1.0))

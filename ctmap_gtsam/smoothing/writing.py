@@ -25,11 +25,12 @@ def write(
     recording: Recording, model: Model, things: Mapping[int, Thing], smoothed: Smoothed, diagnostics: dict[str, object]
 ) -> Estimate:
     """Every object at every keyframe: smoothed where measured, held between."""
-    kept = [thing for _, thing in sorted(things.items()) if thing.posteriors]
+    kept = [thing for _, thing in sorted(things.items()) if thing.best_class in thing.posteriors]
     tables = Tables(len(kept), len(recording.keyframes), len(model.catalogue))
     for row, thing in enumerate(kept):
         _write_thing(tables, row, thing, recording, model, smoothed)
-        _write_moves(tables, row, thing, recording)
+        _write_moves(tables, row, thing, recording, model.config.prediction.significant_period_s)
+        _write_ledger(tables, row, thing)
     return build_estimate(
         recording.run,
         model.config,
@@ -97,16 +98,33 @@ def _write_alternatives(
             )
 
 
-def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording) -> None:
+def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
+    """What each potential says at the mode that the best path goes through, and the score vectors' word on the class."""
+    c = thing.best_class
+    for k, stage, state in zip(thing.keyframes, thing.stages[c], thing.posteriors[c].path, strict=True):
+        modes = thing.sightings[k].modes[c]
+        if modes is None or state == len(stage.log_evidence):
+            continue
+        depth = float(modes.depth_log_ratio[state])
+        tables.note(row, k, "depth", depth)
+        tables.note(row, k, "detection", float(modes.log_likelihood[state]) - depth)
+        tables.note(row, k, "context", float(stage.log_evidence[state] - modes.log_likelihood[state]))
+    if thing.keyframes:
+        tables.note(row, thing.keyframes[0], "class", float(thing.score_evidence[c]))
+
+
+def _write_moves(
+    tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float
+) -> None:
     """A line for every gap in view long enough to hold a move."""
     posterior = thing.posteriors.get(thing.best_class)
     if posterior is None:
         return
     frames = recording.run.frames
     for i, (a, b) in enumerate(zip(thing.keyframes, thing.keyframes[1:], strict=False)):
-        if posterior.moved[i] < 0.5 and b == a + 1:
-            continue
         times = [frames[int(recording.keyframes[k])].time_ns for k in (a, b)]
+        if posterior.moved[i] < 0.5 and (times[1] - times[0]) * 1e-9 < significant_period_s:
+            continue
         none = -(1 << 31)
         tables.moves.append((row, (a, b), float(posterior.moved[i]), tuple(times), none, none))
 
