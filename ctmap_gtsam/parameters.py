@@ -52,8 +52,12 @@ class Prediction:
 
     rotation_rate: float = option(0.01, "random walk in view, rad per sqrt(s)", low=1e-6)
     translation_rate: float = option(0.002, "random walk in view, metres per sqrt(s)", low=1e-6)
-    jump_probability: float = option(1e-4, "chance a keyframe that a seen pose is elsewhere nearby", low=1e-15, high=0.5)
-    region_radius_m: float = option(0.3, "radius of that neighbourhood, and of where a first pose may be, metres", low=0.01)
+    jump_probability: float = option(
+        1e-4, "chance a keyframe that a seen pose is elsewhere nearby", low=1e-15, high=0.5
+    )
+    region_radius_m: float = option(
+        0.3, "radius of that neighbourhood, and of where a first pose may be, metres", low=0.01
+    )
     stay_limit: float = option(0.5, "r1 of Equation 2: P(stay) after an endless absence", low=0.0, high=1.0)
     significant_period_s: float = option(10.0, "absences shorter than this can't hold a move, s", low=0.0)
 
@@ -109,5 +113,7 @@ class Smoother:
     search_share: float = option(0.7, "effort of such a search, as a share of the configured one", low=0.01)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
-    bias_rotation_rad: float = option(0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6)
+    bias_rotation_rad: float = option(
+        0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
+    )
     bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)

@@ -364,9 +364,7 @@ class Updater:
         return self.proposer.log_clutter(self.model.shapes[best], view, T)
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
-        return generator(
-            self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index
-        )
+        return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
 
 
 def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:

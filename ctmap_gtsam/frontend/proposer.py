@@ -119,12 +119,18 @@ class Proposer:
         """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
         self.hypotheses_scored += len(T_camera_centre)
         scores = score_depth(
-            shape.mesh, view.tile, T_camera_centre, self.model.depth_parameters, self.model.config.sensor.occlusion_margin_m
+            shape.mesh,
+            view.tile,
+            T_camera_centre,
+            self.model.depth_parameters,
+            self.model.config.sensor.occlusion_margin_m,
         )
         scores = replace(scores, log_ratio=view.samples * scores.log_ratio)
         return view.share * self.model.log_likelihood(scores, view.detection, view.image_size), scores
 
-    def search(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0) -> Array:
+    def search(
+        self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0
+    ) -> Array:
         """A fresh search in a view with a detection: refined poses (K, 4, 4), not yet sorted out.
 
         Args:
@@ -173,7 +179,9 @@ class Proposer:
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
 
-    def _draw(self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int) -> Array | None:
+    def _draw(
+        self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int
+    ) -> Array | None:
         """The paper's first particles: (n, 4, 4)."""
         assert view.detection is not None
         box = np.array(view.detection.box)

@@ -134,7 +134,9 @@ def build(
     return built
 
 
-def smooth(built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]], n: int) -> Smoothed:
+def smooth(
+    built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]], n: int
+) -> Smoothed:
     """Solve and take the marginals; n is the number of keyframes."""
     settings = model.config.smoother
     solution = optimise(
@@ -147,8 +149,7 @@ def smooth(built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape
 
     cameras = [read(camera_key(k)) for k in range(n)]
     poses = {
-        row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured}
-        for row, (_, measured) in objects.items()
+        row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured} for row, (_, measured) in objects.items()
     }
     return Smoothed(solution, np.stack([c[0] for c in cameras]), np.stack([c[1] for c in cameras]), poses)
 
@@ -226,9 +227,7 @@ def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
     built.add("bias", gtsam.PriorFactorVector(key, np.zeros(6), noise))
 
 
-def _add_context(
-    built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]]
-) -> None:
+def _add_context(built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]]) -> None:
     """Category context of related pairs, one fact spread over the keyframes that they share."""
     rows = sorted(objects)
     origin = np.zeros(3)

@@ -52,7 +52,9 @@ def _same(a: Thing, b: Thing, model: Model) -> bool:
 def join_moved(things: Mapping[int, Thing], recording: Recording, model: Model) -> dict[int, Thing]:
     """Join each object that vanished with the one that it reappeared as; the rest stays as it is."""
     joined = dict(things)
-    vanished = [t for t in things.values() if t.exists and (last := _last_present(t)) is not None and last < t.keyframes[-1]]
+    vanished = [
+        t for t in things.values() if t.exists and (last := _last_present(t)) is not None and last < t.keyframes[-1]
+    ]
     appeared = [t for t in things.values() if t.exists and _first_present(t) is not None]
     if not vanished or not appeared:
         return joined

@@ -128,9 +128,7 @@ def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[i
     return found
 
 
-def _search(
-    found: Found, track: Track, observation: Observation, place: Place, proposer: Proposer
-) -> None:
+def _search(found: Found, track: Track, observation: Observation, place: Place, proposer: Proposer) -> None:
     model = proposer.model
     detection = track.at(observation.keyframe)
     assert detection is not None

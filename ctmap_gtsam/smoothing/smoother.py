@@ -81,9 +81,7 @@ def _first_round(recording: Recording, proposer: Proposer, progress: Progress) -
     found = seed(recording, proposer, progress)
     wishes = {i: _wish(f) for i, f in found.items()}
     tracks = {t.track_id: (t,) for t in recording.tracks}
-    sightings = gather(
-        recording, proposer, lambda i, _: wishes[i], tracks, lambda _i, _k: (), progress, "round 1"
-    )
+    sightings = gather(recording, proposer, lambda i, _: wishes[i], tracks, lambda _i, _k: (), progress, "round 1")
     return _solve(recording, proposer.model, tracks, sightings)
 
 
@@ -138,9 +136,7 @@ def _solve(
     sightings: Mapping[int, Mapping[int, Sighting]],
 ) -> Map:
     """Trellis for every object, identities over gaps, then one graph."""
-    things = {
-        i: judge(i, tracks[i], sightings[i], recording, model) for i in tracks if sightings[i]
-    }
+    things = {i: judge(i, tracks[i], sightings[i], recording, model) for i in tracks if sightings[i]}
     things = join_moved(merge_duplicates(things, model), recording, model)
     cameras = [
         Camera(recording.T_world_camera(k), recording.time_s(k), recording.run.frames[int(f)].visit)
@@ -181,5 +177,3 @@ def _diagnostics(proposer: Proposer, current: Map, energies: list[dict[str, floa
         "factors": dict(current.factors),
         "solver": {"end": solution.end, "trace": list(solution.trace)},
     }
-
-

@@ -72,9 +72,7 @@ def _write_thing(
         _write_alternatives(tables, row, k, thing, recording, model)
 
 
-def _write_alternatives(
-    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model
-) -> None:
+def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model) -> None:
     """Other modes of the best class, and the modes of other classes that are still possible, as the trellis weighs them."""
     for c, posterior in thing.posteriors.items():
         if thing.class_probability[c] < _REPORTED or k not in thing.sightings:
@@ -113,9 +111,7 @@ def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
         tables.note(row, thing.keyframes[0], "class", float(thing.score_evidence[c]))
 
 
-def _write_moves(
-    tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float
-) -> None:
+def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float) -> None:
     """A line for every gap in view long enough to hold a move."""
     posterior = thing.posteriors.get(thing.best_class)
     if posterior is None:
@@ -127,5 +123,3 @@ def _write_moves(
             continue
         none = -(1 << 31)
         tables.moves.append((row, (a, b), float(posterior.moved[i]), tuple(times), none, none))
-
-

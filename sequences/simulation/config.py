@@ -18,7 +18,9 @@ class PlaceConfig:
 
     objects: int = option(10, "small things in the place; classes repeat once all have been used", low=1, high=40)
     distractors: int = option(2, "classes in the catalogue of which the place has none", low=0)
-    known_furniture: bool = option(True, "whether table and shelf are objects of the catalogue, or surfaces nobody modelled")
+    known_furniture: bool = option(
+        True, "whether table and shelf are objects of the catalogue, or surfaces nobody modelled"
+    )
     together: float = option(0.75, "probability that a thing stands where its category has its spot", low=0.0, high=1.0)
     clearance_m: float = option(0.012, "least gap between the outlines of two things on one surface, metres", low=0.0)
 
