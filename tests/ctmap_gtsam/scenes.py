@@ -1,6 +1,7 @@
 """Frames of things on a table, rendered: what the estimators are tried on where the answer is known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,3 +130,51 @@ def run_of(catalogue: Catalogue, frames: Sequence[Frame], noise: LocalisationNoi
     n = 1 + max(f.visit for f in frames)
     visits = tuple(Visit(v + 1, tuple(f for f in frames if f.visit == v), np.eye(4)) for v in range(n))
     return Run(Path("run"), "run", catalogue, visits, UP, noise or LocalisationNoise(), "fingerprint")
+
+
+def small_run(
+    names: Sequence[str] = ("mug", "soup_can"),
+    others: Sequence[str] = ("banana",),
+    *,
+    frames: int = 6,
+    visits: int = 1,
+    seed: int = 0,
+    seen: Callable[[int, str], bool] = lambda k, name: True,
+    there: Callable[[int, str], bool] = lambda k, name: True,
+) -> tuple[Run, dict[str, np.ndarray]]:
+    """A camera goes round a table with some things on it: the run, and T_world_object of each thing.
+
+    Args:
+        names: what stands on the table, at fixed spots.
+        others: further classes of the catalogue.
+        frames: images a visit, half a second apart.
+        visits: an hour apart.
+        seed: of the noise of depth, 1 mm, and boxes.
+        seen: (frame, name) -> whether the detector finds it.
+        there: (frame, name) -> whether it stands there.
+    """
+    model = model_of(*names, *others)
+    rng = np.random.default_rng(seed)
+    placed = {
+        name: standing(shape_named(model, name), *spot, yaw)
+        for name, spot, yaw in zip(names, ((-0.08, 0.0), (0.1, 0.03), (0.0, 0.16)), (0.4, 1.0, 2.0), strict=False)
+    }
+    made = []
+    for k in range(frames * visits):
+        T_world_camera = looking(0.12 * (k % frames) - 0.3, 0.75, 0.75)
+        T = se3.inverse(T_world_camera)
+        present = [(shape_named(model, name), placed[name]) for name in names if there(k, name)]
+        depth = depth_of(present, T_world_camera)
+        depth = (depth + (depth > 0) * 0.001 * rng.normal(size=depth.shape)).astype(np.float32)
+        found = [detection_of(s, T @ pose, len(model.shapes)) for s, pose in present if seen(k, s.source.name)]
+        shaken = [Detection(tuple(np.array(d.box) + rng.normal(size=4)), d.class_scores) for d in found]
+        time_s = 3600.0 * (k // frames) + 0.5 * (k % frames)
+        made.append(frame_of(k, T_world_camera, depth, shaken, visit=k // frames, time_s=time_s))
+    truth = {name: shape_named(model, name).to_object(T) for name, T in placed.items()}
+    return run_of(model.catalogue, made), truth
+
+
+def cut(run: Run, n: int) -> Run:
+    """The first n frames of a run."""
+    visits = tuple(replace(v, frames=tuple(f for f in v.frames if f.index < n)) for v in run.visits)
+    return replace(run, visits=tuple(v for v in visits if v.frames))

@@ -1,0 +1,139 @@
+"""Laws of the filter over a run: each keyframe sees only the past, and what is there is found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.filtering.filter import filter_run
+from factors.symmetry import Symmetry, residual
+from tests.ctmap_gtsam.scenes import CHEAP, config_of, cut, small_run
+
+CONFIG = config_of(*CHEAP, "filter.search_every=2")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return small_run()
+
+
+@pytest.fixture(scope="module")
+def estimate(scene) -> Estimate:
+    return filter_run(scene[0], CONFIG)
+
+
+def rows_of(estimate, k):
+    """What is said at keyframe k, by object id."""
+    out = {}
+    for row, i in enumerate(estimate.object_id):
+        own = (estimate.modes.object == row) & (estimate.modes.keyframe == k)
+        modes = {name: value[own] for name, value in vars(estimate.modes).items() if name not in ("object", "keyframe")}
+        ledger = (estimate.ledger.object == row) & (estimate.ledger.keyframe == k)
+        if own.any():
+            out[int(i)] = (
+                estimate.class_probability[row, k],
+                estimate.existence[row, k],
+                estimate.in_view[row, k],
+                modes,
+                estimate.ledger.nats[ledger],
+            )
+    return out
+
+
+@pytest.mark.parametrize("n", [1, 3, 5])
+def test_the_first_keyframes_are_those_of_a_run_cut_after_them(scene, estimate, n):
+    """Law 2 of the model, for the filter."""
+    short = filter_run(cut(scene[0], n), CONFIG)
+    assert list(short.keyframe_frame) == list(estimate.keyframe_frame[:n])
+    for k in range(n):
+        whole, part = rows_of(estimate, k), rows_of(short, k)
+        assert whole.keys() == part.keys()
+        for i in whole:
+            for a, b in zip(whole[i][:3] + whole[i][4:], part[i][:3] + part[i][4:], strict=True):
+                np.testing.assert_array_equal(a, b)
+            for name, value in whole[i][3].items():
+                np.testing.assert_array_equal(value, part[i][3][name])
+
+
+def test_nothing_is_said_of_a_thing_before_its_track_has_started(estimate):
+    started = CONFIG.frontend.start_after - 1
+    assert (estimate.existence[:, :started] == 0.0).all()
+    assert (estimate.best_mode[:, :started] == -1).all()
+    assert (estimate.best_mode[:, started:] >= 0).all()
+    np.testing.assert_allclose(estimate.class_probability.sum(-1), 1.0)
+    np.testing.assert_allclose(estimate.class_probability[:, :started], 1.0 / len(estimate.class_ids))
+
+
+def test_what_stands_there_is_found(scene):
+    run, truth = scene
+    estimate = filter_run(run)
+    assert len(estimate.object_id) == len(truth)
+    for name, T in truth.items():
+        source = next(c for c in run.catalogue.classes if c.name == name)
+        row = int(np.argmin(np.linalg.norm(estimate.pose[:, -1, :3, 3] - T[:3, 3], axis=-1)))
+        assert estimate.best_class[row, -1] == source.obj_id
+        assert estimate.existence[row, -1] > 0.9
+        r = residual(estimate.pose[row, -1], T, Symmetry.of(source))
+        assert np.linalg.norm(r[3:]) < 0.006
+        assert estimate.in_view[row, -1]
+
+
+def test_mixtures_are_normalised_and_covariances_proper(estimate):
+    m = estimate.modes
+    for row in range(len(estimate.object_id)):
+        for k in range(len(estimate.keyframe_frame)):
+            for c in np.unique(m.class_id):
+                own = (m.object == row) & (m.keyframe == k) & (m.class_id == c)
+                assert np.exp(m.log_weight[own]).sum() <= 1.0 + 1e-9
+    assert (np.linalg.eigvalsh(m.covariance)[:, 0] > 0).all()
+    assert np.isfinite(m.T_world_object).all()
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(scene, estimate, tmp_path):
+    again, other = filter_run(scene[0], CONFIG), filter_run(scene[0], replace(CONFIG, seed=1))
+    for name, some in (("a", estimate), ("b", again), ("c", other)):
+        some.save(tmp_path / f"{name}.npz")
+    a, b, c = ((tmp_path / f"{name}.npz").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_a_thing_that_was_taken_away_is_missed():
+    """Its place is seen empty from the fifth frame on."""
+    run, truth = small_run(frames=10, there=lambda k, name: name != "mug" or k < 5)
+    estimate = filter_run(run, CONFIG)
+    mug = int(np.argmin(np.linalg.norm(estimate.pose[:, 4, :3, 3] - truth["mug"][:3, 3], axis=-1)))
+    assert estimate.existence[mug, 4] > 0.9
+    assert estimate.existence[mug, -1] < 0.5
+    assert estimate.existence[1 - mug, -1] > 0.9
+
+
+def test_a_thing_that_the_detector_misses_is_still_there():
+    run, truth = small_run(frames=8, seen=lambda k, name: name != "mug" or k < 4)
+    estimate = filter_run(run, CONFIG)
+    mug = int(np.argmin(np.linalg.norm(estimate.pose[:, 3, :3, 3] - truth["mug"][:3, 3], axis=-1)))
+    assert estimate.existence[mug, -1] > 0.8
+    assert estimate.best_class[mug, -1] == run.catalogue.classes[2].obj_id
+    assert np.linalg.norm(estimate.pose[mug, -1, :3, 3] - estimate.pose[mug, 3, :3, 3]) < 0.005
+
+
+def test_an_hour_unseen_leaves_room_for_a_move_and_seeing_it_again_none():
+    run, truth = small_run(frames=4, visits=2)
+    estimate = filter_run(run, CONFIG)
+    assert len(estimate.object_id) == len(truth)
+    assert (estimate.existence[:, -1] > 0.9).all()
+
+
+def test_without_boxes_there_is_nothing():
+    run, _ = small_run(frames=3, seen=lambda k, name: False)
+    estimate = filter_run(run, CONFIG)
+    assert len(estimate.object_id) == 0
+    assert estimate.T_world_camera.shape == (3, 4, 4)
+
+
+def test_t_map_says_nothing_of_context(scene):
+    estimate = filter_run(scene[0], CONFIG, context=False)
+    assert estimate.meta["method"] == "filter-t"
+    context = estimate.meta["potentials"].index("context")
+    np.testing.assert_allclose(estimate.ledger.nats[estimate.ledger.potential == context], 0.0, atol=1e-9)
