@@ -43,7 +43,7 @@ class Tables:
     def mode(
         self, row: int, keyframe: int, class_id: int, log_weight: float, T: Array, covariance: Array, free: Array
     ) -> None:
-        """Add one pose mode: T_world_object (4, 4), covariance (6, 6) and free axes (6, f <= 3) of its right tangent."""
+        """Add a pose mode: T_world_object (4, 4), covariance (6, 6) and free axes (6, f <= 3) of its right tangent."""
         axes = np.zeros((6, 3))
         axes[:, : free.shape[1]] = free
         self.modes.append((row, keyframe, class_id, log_weight, T, covariance, axes))

@@ -206,6 +206,7 @@ def _run_method(run: Run, method: Method, config: Config, store: Path | None, pr
     stored = _Stored(store, method.name, json.loads(json.dumps(key))) if store is not None else None
     if stored is not None and (found := stored.load()) is not None:
         return found
+    assert method.run is not None
     start = time.perf_counter()
     estimate = method.run(run, config, progress)
     seconds = time.perf_counter() - start

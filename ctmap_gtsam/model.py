@@ -58,7 +58,7 @@ class Model:
 
     @cached_property
     def log_confusion(self) -> Array:
-        """(C, C) log pi(d | c): the class d that the detector persistently believes, for the true class c (columns d)."""
+        """(C, C) log pi(d | c): the detector persistently believes class d (column) where the true class is c (row)."""
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
 
     def prediction_covariance(self, dt_s: float) -> Array:
@@ -74,8 +74,8 @@ class Model:
     def view_share(self, before: Array, after: Array, dt_s: float) -> float:
         """How much of a view is news, 0 to 1: the share its evidence counts.
 
-        What depth and detector get wrong of an object, they get wrong again in the next frame from the same side. So that
-        more frames of one view are not more evidence, a frame counts by how far the camera has moved around it.
+        What depth and detector get wrong of an object, they get wrong again in the next frame from the same side. So
+        that more frames of one view are not more evidence, a frame counts by how far the camera has moved around it.
 
         Args:
             before: (3,) from the object to the camera at the last view, metres, world frame.
@@ -100,7 +100,10 @@ class Model:
         return self.kappa * scores.log_ratio + self.detection(visible, boxes)
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
-        """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), xywh; some boxes have nothing to do with theirs."""
+        """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
+
+        A mixture: some detected boxes have nothing to do with their objects.
+        """
         d = self.config.detector
         matched = box_log_ratio(detected, np.nan_to_num(rendered), d.box_sigma, image_size)
         return np.logaddexp(np.log1p(-d.box_outlier) + matched, np.log(d.box_outlier))
@@ -117,5 +120,5 @@ class Model:
         return class_log_ratio(detection.class_scores, floor=self.config.detector.score_floor)
 
     def class_evidence(self, summed: Array) -> Array:
-        """(C,) log evidence of the true class c from the summed class_scores (C,) of one track and visit: saturating."""
+        """(C,) log evidence of the true class c from class_scores (C,) summed over a track and visit: saturating."""
         return persistent_class_log_evidence(summed, self.log_confusion)

@@ -10,7 +10,7 @@ from sequences.options import option
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Which frames the estimators use. A frame is a keyframe where it is the first of a visit or meets all three."""
+    """Which frames the estimators use: the first of a visit, and each n-th at which the camera has moved or turned."""
 
     every: int = option(1, "use every n-th frame", low=1)
     min_translation_m: float = option(0.0, "and only after the camera moved so far, metres ...", low=0.0)
@@ -79,7 +79,7 @@ class Frontend:
 
     association_iou: float = option(0.4, "least overlap of a box with its track's predicted box", low=0.0, high=1.0)
     start_after: int = option(3, "consistent frames before a track is estimated", low=1)
-    lost_after_s: float = option(2.0, "a track without a box for so long in view is not continued, s", low=0.0)
+    lost_after_s: float = option(2.0, "a track not yet started is given up after so long without a box, s", low=0.0)
     angular_step_rad: float = option(0.0075, "depth is sampled at this step", low=1e-4)
     region_margin: float = option(0.5, "depth is scored in the box enlarged by this share on each side", low=0.0)
     mesh_faces: int = option(500, "triangles of the meshes that score", low=20)

@@ -40,7 +40,7 @@ class Shape:
     symmetry: Symmetry
     """in the centre frame"""
     radius_m: float
-    """root mean square distance of the surface from the centre: turns rad into metres"""
+    """root mean square distance of the vertices from the centre: turns rad into metres"""
 
     @cached_property
     def reach_m(self) -> float:

@@ -1,7 +1,8 @@
 """How far a point is from a mesh, and on which side: a signed distance field on a grid.
 
 The sign is that of the generalised winding number (Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013), which forgives
-holes and needs no consistent normals at edges; solid angles after van Oosterom and Strackee (IEEE Trans. Biomed. Eng. 1983).
+holes and needs no consistent normals at edges; solid angles after van Oosterom and Strackee (IEEE Trans. Biomed. Eng.
+1983).
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def _spread(mesh: Mesh) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _winding(points, vertices, faces):  # type: ignore[no-untyped-def]
+def _winding(points, vertices, faces):
     out = np.zeros(points.shape[0])
     for p in numba.prange(points.shape[0]):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]

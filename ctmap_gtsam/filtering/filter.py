@@ -1,8 +1,8 @@
 """CT-Map's filter (Algorithm 1): particle sets for each object, each keyframe seeing only the past.
 
 Departures from the letter, each for a reason: classes have their own particle sets and evidence, so that a class can't
-die out by bad luck (Rao-Blackwellisation over the class); particles are also proposed around the score's modes, which the
-weights account for; the context multiplies the reported posterior once, not once a keyframe.
+die out by bad luck (Rao-Blackwellisation over the class); particles are also proposed around the score's modes, which
+the weights account for; the context multiplies the reported posterior once, not once a keyframe.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class _State:
         self.reports: list[dict[int, Reported]] = []
 
     def step(self, observation: Observation) -> None:
-        """Algorithm 1 for every object: neighbours are those of the keyframe before, so the order of objects is nothing."""
+        """Algorithm 1 for every object. Neighbours are those of the keyframe before, so objects have no order."""
         self.associator.step(observation)
         self.place.update(observation)
         before = self.reports[-1] if self.reports else {}
@@ -88,7 +88,8 @@ class _State:
     def _start(self, observation: Observation, before: Mapping[int, Reported]) -> dict[int, Reported]:
         """Beliefs of tracks that have just become consistent.
 
-        They know no neighbours among themselves yet, so all start a second time beside those that were sure of themselves.
+        They know no neighbours among themselves yet, so all start a second time beside those that were sure of
+        themselves.
         """
         new = [track for track in self.associator.tracks() if track.track_id not in self.beliefs]
         started: dict[int, Belief] = {}

@@ -4,12 +4,12 @@ The next particles are drawn from a mixture of the prediction and of proposals a
 
     w = [ sum_k w_k phi_p(x | x_k) ] phi_m(x) / q(x)
 
-with the whole previous set in the numerator (the marginal particle filter of Klaas, de Freitas and Doucet, UAI 2005), so that a
-particle may come from a proposal that never saw its predecessor. With q equal to the prediction this is Algorithm 1.
-The mean weight is the evidence p(z_t | z_1:t-1) of the class.
+with the whole previous set in the numerator (the marginal particle filter of Klaas, de Freitas and Doucet, UAI 2005),
+so that a particle may come from a proposal that never saw its predecessor. With q equal to the prediction this is
+Algorithm 1. The mean weight is the evidence p(z_t | z_1:t-1) of the class.
 
-The prediction is isotropic about the object's centre, so phi_p is a Gaussian in the chord between two rotations and in the
-distance between two centres: exact to second order, and a matrix product for all pairs.
+The prediction is isotropic about the object's centre, so phi_p is a Gaussian in the chord between two rotations and in
+the distance between two centres: exact to second order, and a matrix product for all pairs.
 """
 
 from __future__ import annotations
@@ -110,7 +110,10 @@ def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape:
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
-    """Poses (K, 4, 4) -> vectors whose squared distance is the exponent of phi_p: |dR|^2 = 2 angle^2 for small angles."""
+    """Poses (K, 4, 4) -> vectors (K, D) whose squared distance is -2 times the exponent of phi_p.
+
+    Their rotations' part: |dR|^2 = 2 angle^2 for small angles.
+    """
     axis = shape.symmetry.axes
     free = shape.symmetry.free
     if free == 0:

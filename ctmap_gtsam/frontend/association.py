@@ -1,8 +1,8 @@
-"""Boxes become tracks: the paper's association of boxes over frames by their overlap, causally, for filter and smoother alike.
+"""Boxes become tracks: the paper's association over frames by overlap, causally, for filter and smoother alike.
 
-A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera: the
-overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track. A
-new track counts only after `start_after` consistent frames.
+A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera:
+the overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track.
+A new track counts only after `start_after` consistent frames.
 """
 
 from __future__ import annotations

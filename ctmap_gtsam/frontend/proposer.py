@@ -1,9 +1,9 @@
 """Poses that explain the depth: drawn as the paper draws its first particles, refined on the depth image, scored.
 
-The paper puts an object's centre around the 3-D points in the box's centre region, with an orientation uniform on SO(3). One such
-draw in some thousands lies within reach of the truth, so the best by score are refined by point-to-plane registration,
-tried again from starts around them and from half-turns, and what remains are the score's modes: the proposals of
-filter and smoother, which weigh them with the model.
+The paper puts an object's centre around the 3-D points in the box's centre region, with an orientation uniform on
+SO(3). One such draw in some thousands lies within reach of the truth, so the best by score are refined by
+point-to-plane registration, tried again from starts around them and from half-turns, and what remains are the score's
+modes: the proposals of filter and smoother, which weigh them with the model.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sequences.types import Detection
 Array = NDArray[np.float64]
 
 COARSE = 2
-"""a first look takes every so many samples: a quarter of the work, and as good for telling what is worth a closer one"""
+"""a first look takes every so many samples: a quarter of the work, and as good for telling what needs a closer one"""
 
 ENOUGH_SAMPLES = 40
 """across a tile, for it to be looked at coarsely"""
@@ -131,9 +131,13 @@ class Proposer:
     def search(
         self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0
     ) -> Array:
-        """A fresh search in a view with a detection: refined poses (K, 4, 4), not yet sorted out.
+        """A fresh search in a view with a detection: refined poses (K, 4, 4) T_camera_centre, not yet sorted out.
 
         Args:
+            shape: the class.
+            view: where to look.
+            observation: the keyframe of the view.
+            rng: draws the poses.
             share: of the configured effort.
         """
         view = view.coarse()
@@ -147,10 +151,13 @@ class Proposer:
         return np.concatenate([coarse, around])
 
     def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True) -> PoseModes:
-        """Refine starts (K, 4, 4), score, merge equal ones and keep the best few.
+        """Refine starts (K, 4, 4) T_camera_centre, score, merge equal ones and keep the best few.
 
         Args:
-            probe: whether to take the covariance from the score's shape (else from the registration's normal equations).
+            shape: the class.
+            view: where to look.
+            starts: (K, 4, 4) T_camera_centre.
+            probe: whether covariances come from the score's shape (else from the registration's normal equations).
         """
         if len(starts) == 0:
             return _no_modes()
@@ -164,8 +171,8 @@ class Proposer:
     def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
 
-        A surface of unknown form explains a share of what the right mesh would, where the background doesn't explain the
-        depth already; its boxes come less often, and fit as well.
+        A surface of unknown form explains a share of what the right mesh would, where the background doesn't explain
+        the depth already; its boxes come less often, and fit as well.
         """
         detector = self.model.config.detector
         if view.detection is None:
@@ -226,7 +233,7 @@ class Proposer:
         return kept
 
     def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> tuple[Array, Array]:
-        """Covariances (n, 6, 6) and free axes (n, 6, 3): how far the score lets a pose go along its normal equations' axes.
+        """Covariances (n, 6, 6), free axes (n, 6, 3): how far the score lets poses go along their normal equations' axes.
 
         The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
         """
@@ -257,9 +264,10 @@ class Proposer:
 
 
 def _widths(drop: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Standard deviations (n, 6) in scaled metres, from the fall of the log-likelihood (n, 6, steps) along each direction.
+    """Standard deviations (n, 6), scaled metres, from the log-likelihood's fall (n, 6, steps) along each direction.
 
-    The first step at which it falls by half a nat, one standard deviation of a Gaussian, tells the width by its parabola.
+    The first step at which it falls by half a nat, one standard deviation of a Gaussian, tells the width by its
+    parabola.
     """
     reached = drop >= 0.5
     flat = ~reached.any(axis=-1)

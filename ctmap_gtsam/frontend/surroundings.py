@@ -34,7 +34,7 @@ class Neighbour:
     """of its being there, nats"""
 
     def yields_to(self, other: Neighbour) -> bool:
-        """Whether both claim the same space and the other has more evidence: the pixels there are then the other's alone."""
+        """Whether both claim the same space and the other has more evidence: the pixels there are the other's alone."""
         stronger = (other.log_evidence, -other.object_id) > (self.log_evidence, -self.object_id)
         return stronger and self._contends(other)
 
@@ -119,8 +119,8 @@ def penetration_depth(shape: Shape, points: Array) -> Array:
 def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:
     """How well poses (K, 4, 4) stand on the level surface that suits them best, nats (K,); 0 where none is below.
 
-    Floating is a hinge with a floor: a thing may rest on something that was not seen. Sinking has no floor: surfaces are
-    solid. A thing wholly beneath a surface has nothing to do with it.
+    Floating is a hinge with a floor: a thing may rest on something that was not seen. Sinking has no floor: surfaces
+    are solid. A thing wholly beneath a surface has nothing to do with it.
     """
     settings = model.config.context
     best = np.full(len(T_world_centre), -np.inf)

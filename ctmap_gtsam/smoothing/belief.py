@@ -50,7 +50,7 @@ class Thing:
 
     @cached_property
     def class_probability(self) -> Array:
-        """(C,)"""
+        """(C,) posterior of the classes."""
         return np.exp(mixture.normalised(self.class_log_evidence))
 
     @property
@@ -200,7 +200,7 @@ def judge(
     evidence = np.full(len(model.shapes), -np.inf)
     for shape in model.shapes:
         c = shape.index
-        if not any(s.modes[c] is not None and len(s.modes[c]) for s in sightings.values()):  # type: ignore[arg-type]
+        if not any(len(modes) for s in sightings.values() if (modes := s.modes[c]) is not None):
             continue
         stages[c] = tuple(_stage(sightings[k], c, len(keyframes), recording) for k in keyframes)
         posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], recording, model))

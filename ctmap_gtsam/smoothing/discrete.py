@@ -1,11 +1,11 @@
 """The trellis: modes, absences and moves of one object of one class over the run, by forward-backward.
 
-States at a keyframe are the view's modes and "gone" (not here at all: not yet, no longer, or elsewhere). A mode's evidence is its
-likelihood times the volume under it, which is the integral of exp(log f - 1/2 r^T L r) over poses; transitions integrate the
-prediction over the mode's Gaussian and over what its most probable past knows (a switching Kalman filter that keeps one
-component a state; Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single views would charge a long
-track for every view anew. The normaliser is the class evidence, against nothing being there; one pass gives
-which mode, when present, and whether it moved. Log space throughout (Rabiner, Proc. IEEE 1989).
+States at a keyframe are the view's modes and "gone" (not here at all: not yet, no longer, or elsewhere). A mode's
+evidence is its likelihood times the volume under it, which is the integral of exp(log f - 1/2 r^T L r) over poses;
+transitions integrate the prediction over the mode's Gaussian and over what its most probable past knows (a switching
+Kalman filter that keeps one component a state; Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single
+views would charge a long track for every view anew. The normaliser is the class evidence, against nothing being there;
+one pass gives which mode, when present, and whether it moved. Log space throughout (Rabiner, Proc. IEEE 1989).
 """
 
 from __future__ import annotations

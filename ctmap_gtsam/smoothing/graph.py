@@ -1,8 +1,9 @@
 """Every object pose and robot pose of the run in one GTSAM graph.
 
-Variables: x_k, the camera at keyframe k; o_ik, object i at keyframe k where a mode measures it; b_iv, the error that all
-depth measurements of object i in visit v share, so that a thousand frames don't make a millimetre of bias certain.
-Factors: localisation, prediction, measurement modes, context, each from `factors`.
+Variables: x_k, the camera at keyframe k; o_ik, object i at keyframe k where a mode measures it; b_iv, the error that
+all depth measurements of object i in visit v share, so that a thousand frames don't make a millimetre of bias certain.
+Factors: measurement modes, prediction, context and gauge (of free rotations) from `factors`; localisation and the
+prior on b_iv from here.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class Camera:
     """A recorded camera pose."""
 
     T_world_camera: Array
+    """(4, 4)"""
     time_s: float
     visit: int
 

@@ -1,8 +1,8 @@
 """Which tracks are one object.
 
 Two of one class in one place are one thing, seen on two tracks. And what left one place and what came to another may be
-the same thing, moved: an object that is gone from some keyframe on and one of the same class that was not there before are
-joined by a global assignment of what vanished to what appeared.
+the same thing, moved: an object that is gone from some keyframe on and one of the same class that was not there before
+are joined by a global assignment of what vanished to what appeared.
 """
 
 from __future__ import annotations

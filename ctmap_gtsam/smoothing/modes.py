@@ -1,8 +1,8 @@
 """Measurement modes of every object, class and keyframe, with the whole run in view.
 
 Seeding searches each track afresh at a few of its detections. Gathering then goes through the run once a round, depth
-read once a keyframe, and refines on each image what was found at other times, what the smoother predicts, and what was there
-before. Only the likelihood goes into a mode: the prior is the graph's and the trellis's business.
+read once a keyframe, and refines on each image what was found at other times, what the smoother predicts, and what was
+there before. Only the likelihood goes into a mode: the prior is the graph's and the trellis's business.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from factors.mixture import log_sum
-from sequences import se3
 from sequences.progress import Progress
 from sequences.seeds import generator
 from sequences.types import Detection, Run
@@ -263,8 +262,3 @@ def in_world(sighting: Sighting, c: int, T_world_camera: Array) -> Array:
     """(n, 4, 4) T_world_centre of a class's modes."""
     modes = sighting.modes[c]
     return np.zeros((0, 4, 4)) if modes is None else T_world_camera @ modes.T_camera_centre
-
-
-def carried(T: Array, before: Array, after: Array) -> Array:
-    """Poses moved along with a camera whose pose was corrected from `before` to `after`."""
-    return after @ se3.inverse(before) @ T

@@ -68,7 +68,7 @@ def smooth_run(
     energies = [dict(current.energy)]
     for number in range(config.smoother.rounds):
         following = _next_round(recording, proposer, current, told, f"round {number + 2}")
-        settled = _distance(current, following, model)
+        settled = _settled(current, following, model)
         current = following
         energies.append(dict(current.energy))
         if settled and number + 1 >= 2:
@@ -152,7 +152,7 @@ def _solve(
     return Map(things, smoothed, built.energy(smoothed.solution.values), built.count())
 
 
-def _distance(a: Map, b: Map, model: Model) -> bool:
+def _settled(a: Map, b: Map, model: Model) -> bool:
     """Whether nothing of note changed from one round to the next."""
     if a.things.keys() != b.things.keys():
         return False

@@ -69,11 +69,11 @@ def _write_thing(
             shape.covariance_to_object(covariance),
             shape.free_axes_to_object(free),
         )
-        _write_alternatives(tables, row, k, thing, recording, model)
+        _write_alternatives(tables, row, k, thing, model)
 
 
-def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model) -> None:
-    """Other modes of the best class, and the modes of other classes that are still possible, as the trellis weighs them."""
+def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
+    """Other modes of the best class, and modes of other classes that are still possible, as the trellis weighs them."""
     for c, posterior in thing.posteriors.items():
         if thing.class_probability[c] < _REPORTED or k not in thing.sightings:
             continue
@@ -97,7 +97,7 @@ def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, recordin
 
 
 def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
-    """What each potential says at the mode that the best path goes through, and the score vectors' word on the class."""
+    """What each potential says at the mode that the best path goes through; the score vectors' word on the class."""
     c = thing.best_class
     for k, stage, state in zip(thing.keyframes, thing.stages[c], thing.posteriors[c].path, strict=True):
         modes = thing.sightings[k].modes[c]
@@ -112,7 +112,7 @@ def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
 
 
 def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float) -> None:
-    """A line for every gap in view long enough to hold a move."""
+    """A line for every gap between views that is long enough to hold a move, or that probably held one."""
     posterior = thing.posteriors.get(thing.best_class)
     if posterior is None:
         return
