@@ -16,15 +16,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlaneSearch:
-    """How planes are looked for; the numbers are those of `find_planes`."""
+    """How `find_planes` looks for planes."""
 
     samples_across: int = 96
+    """of the image's width, at least so many"""
     candidates: int = 150
+    """oriented points tried a plane"""
     tolerance_per_m: float = 0.012
+    """distance of an inlier from its plane, metres for each metre of depth"""
     normal_tolerance_rad: float = 0.35
+    """angle of an inlier's normal to the plane's"""
     min_share: float = 0.04
+    """least share of the measured samples on a plane"""
     max_planes: int = 4
     margin_m: float = 0.02
+    """by which outlines reach beyond their points"""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Plane:
     hull: Array
     """(H, 2) convex outline in the plane's x and y, metres, margin included"""
     share: float
-    """of the image's measured samples that lie on it"""
+    """of the image's samples that have a normal, those that lie on it"""
 
     @property
     def area(self) -> float:

@@ -181,8 +181,3 @@ def uniform_rotations(uniforms: Array) -> Array:
     a, b = np.sqrt(1.0 - u[..., 0]), np.sqrt(u[..., 0])
     p, r = 2.0 * np.pi * u[..., 1], 2.0 * np.pi * u[..., 2]
     return rotation_from_quaternion(np.stack([a * np.sin(p), a * np.cos(p), b * np.sin(r), b * np.cos(r)], axis=-1))
-
-
-def interpolate(A: Array, B: Array, fraction: float | Array) -> Array:
-    """The motion a fraction of the way from A to B on the geodesic of SE(3): (..., 4, 4)."""
-    return retract(A, np.asarray(fraction, dtype=np.float64)[..., None] * local(A, B))

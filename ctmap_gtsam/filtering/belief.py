@@ -135,8 +135,8 @@ class Updater:
         for shape in self.model.shapes:
             rng = self._rng("filter.start", track.track_id, observation, shape)
             starts = self.proposer.search(shape, view, observation, rng)
-            modes = self._in_world(self.proposer.modes(shape, view, starts), observation)
-            classes.append(self._weigh(None, modes, shape, view, observation, count, rng))
+            proposals = self._in_world(self.proposer.modes(shape, view, starts), observation)
+            classes.append(self._weigh(None, proposals, shape, view, observation, count, rng))
         fresh = Belief(
             object_id=track.track_id,
             classes=tuple(classes),
@@ -184,7 +184,7 @@ class Updater:
         )
         return replace(moved, log_clutter=belief.log_clutter + self._clutter(moved, view, observation))
 
-    def report(self, belief: Belief, observation: Observation, around: Surroundings) -> Reported:
+    def report(self, belief: Belief, around: Surroundings) -> Reported:
         """The posterior, the context multiplied in once."""
         log_evidence = belief.class_log_evidence(self.model)
         weighted: list[tuple[ClassBelief, Array] | None] = []
@@ -282,9 +282,9 @@ class Updater:
         if view.detection is not None and belief.steps % self.model.config.filter.search_every == 0:
             found = self.proposer.search(shape, view, observation, rng, self.model.config.filter.search_share)
             starts = np.concatenate([starts, found])
-        modes = self._in_world(self.proposer.modes(shape, view, starts, probe=likely), observation)
+        proposals = self._in_world(self.proposer.modes(shape, view, starts, probe=likely), observation)
         spread = self._spread(observation, belief.time_ns, starts)
-        return self._weigh(own, modes, shape, view, observation, count, rng, spread)
+        return self._weigh(own, proposals, shape, view, observation, count, rng, spread)
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
@@ -306,7 +306,7 @@ class Updater:
     def _weigh(
         self,
         own: ClassBelief | None,
-        modes: tuple[PoseModes, Gaussians | None],
+        proposals: Gaussians | None,
         shape: Shape,
         view: View,
         observation: Observation,
@@ -315,7 +315,6 @@ class Updater:
         spread: Spread | None = None,
     ) -> ClassBelief | None:
         """Draw from prediction and proposals, weigh by the model (see `particles`)."""
-        proposals = modes[1]
         log_uniform = self.model.log_uniform(shape)
         if proposals is None and own is None:
             return None
@@ -344,15 +343,15 @@ class Updater:
         before = 0.0 if own is None else own.log_evidence
         return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained)
 
-    def _in_world(self, modes: PoseModes, observation: Observation) -> tuple[PoseModes, Gaussians | None]:
-        """The modes as proposals in the world frame."""
+    def _in_world(self, modes: PoseModes, observation: Observation) -> Gaussians | None:
+        """The modes as proposals in the world frame; None where there are none."""
         if not len(modes):
-            return modes, None
+            return None
         # half of the proposals' weight goes by likelihood, half is spread evenly: the likelihood may be wrong
         by_score = np.exp(mixture.normalised(modes.log_likelihood))
         weight = np.log(0.5 * by_score + 0.5 / len(modes))
         poses = observation.frame.T_world_camera @ modes.T_camera_centre
-        return modes, Gaussians(poses, _INFLATION * modes.covariance, weight)
+        return Gaussians(poses, _INFLATION * modes.covariance, weight)
 
     def _clutter(self, belief: Belief, view: View, observation: Observation) -> float:
         """What this keyframe says for something that no mesh explains, where the best hypothesis stands, nats."""

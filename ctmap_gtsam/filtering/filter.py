@@ -82,7 +82,7 @@ class _State:
             i, around = track.track_id, surroundings.without(track.track_id)
             detection = track.at(observation.keyframe)
             self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
-            reported[i] = self.updater.report(self.beliefs[i], observation, around)
+            reported[i] = self.updater.report(self.beliefs[i], around)
         self.reports.append(reported | self._start(observation, before))
 
     def _start(self, observation: Observation, before: Mapping[int, Reported]) -> dict[int, Reported]:
@@ -99,9 +99,7 @@ class _State:
             for track in new:
                 around = surroundings.without(track.track_id)
                 started[track.track_id] = self.updater.start(track, observation, around)
-            reported = {
-                i: self.updater.report(belief, observation, surroundings.without(i)) for i, belief in started.items()
-            }
+            reported = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
         self.beliefs |= started
         return reported
 

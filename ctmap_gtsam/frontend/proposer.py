@@ -69,8 +69,6 @@ class PoseModes:
     """(n,) the depth's part of it"""
     covariance: Array
     """(n, 6, 6) of the right tangent, from the score's own shape"""
-    free_axes: Array
-    """(n, 6, 3) directions the score is flat in, orthonormal columns, zero where unused"""
 
     def __len__(self) -> int:
         return len(self.log_likelihood)
@@ -165,8 +163,8 @@ class Proposer:
         score, scores = self.score(shape, view, candidates)
         keep = self._distinct(shape, candidates, score)
         poses = candidates[keep]
-        covariance, free = self._shape_of_score(shape, view, poses, probe)
-        return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance, free)
+        covariance = self._shape_of_score(shape, view, poses, probe)
+        return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance)
 
     def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
@@ -232,8 +230,8 @@ class Proposer:
             kept.append(int(row))
         return kept
 
-    def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> tuple[Array, Array]:
-        """Covariances (n, 6, 6), free axes (n, 6, 3): how far the score lets poses go along their normal equations' axes.
+    def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> Array:
+        """Covariances (n, 6, 6): how far the score lets a pose go along the axes of its normal equations.
 
         The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
         """
@@ -241,7 +239,7 @@ class Proposer:
         unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
         directions = np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)  # (n, 6 directions, 6)
         if not probe:
-            return self._laplace(view.share * hessian, unit), np.zeros((len(poses), 6, 3))
+            return self._laplace(view.share * hessian, unit)
         view = view.coarse()
         steps = np.concatenate([_LADDER_M, -_LADDER_M])
         offsets = directions[:, :, None] * steps[:, None] * unit
@@ -251,10 +249,9 @@ class Proposer:
         self.hypotheses_scored += len(around)
         here, there = depth[: len(poses)], depth[len(poses) :].reshape(len(poses), 6, -1)
         drop = view.share * self.model.kappa * (here[:, None, None] - there)
-        sigma, flat = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
+        sigma = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
         scaled = directions * unit
-        covariance = np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled)
-        return covariance, _free_axes(scaled, flat)
+        return np.asarray(np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled))
 
     def _laplace(self, hessian: Array, unit: Array) -> Array:
         sensor = self.model.config.sensor
@@ -263,28 +260,18 @@ class Proposer:
         return np.linalg.inv(scaled) * unit[:, None] * unit
 
 
-def _widths(drop: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _widths(drop: Array) -> Array:
     """Standard deviations (n, 6), scaled metres, from the log-likelihood's fall (n, 6, steps) along each direction.
 
     The first step at which it falls by half a nat, one standard deviation of a Gaussian, tells the width by its
-    parabola.
+    parabola; the last step is the width where it never does.
     """
     reached = drop >= 0.5
     flat = ~reached.any(axis=-1)
     first = np.where(flat, len(_LADDER_M) - 1, np.argmax(reached, axis=-1))
     fall = np.maximum(np.take_along_axis(drop, first[..., None], axis=-1)[..., 0], 0.5)
-    return _LADDER_M[first] / np.sqrt(2.0 * fall), flat
-
-
-def _free_axes(directions: Array, flat: NDArray[np.bool_]) -> Array:
-    """Up to three flat directions as unit columns: (n, 6, 6), (n, 6) -> (n, 6, 3)."""
-    out = np.zeros((len(directions), 6, 3))
-    for row in range(len(directions)):
-        chosen = directions[row][flat[row]][:3]
-        if len(chosen):
-            out[row, :, : len(chosen)] = np.linalg.qr(chosen.T)[0]
-    return out
+    return np.asarray(_LADDER_M[first] / np.sqrt(2.0 * fall))
 
 
 def _no_modes() -> PoseModes:
-    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros((0, 6, 3)))
+    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)))

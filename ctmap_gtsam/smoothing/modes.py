@@ -58,9 +58,6 @@ class Sighting:
     """One object in one keyframe in whose view it should be."""
 
     keyframe: int
-    detection: Detection | None
-    share: float
-    """of the view that is news; see `Model.view_share`"""
     modes: tuple[PoseModes | None, ...]
     """one a class, camera frame; None for classes no longer possible"""
     context: tuple[Array, ...]
@@ -230,7 +227,7 @@ def _sight(
         poses = observation.frame.T_world_camera @ found.T_camera_centre
         context.append(around.log_potential(model, shape, poses))
     clutter = _log_clutter(proposer, view, modes)
-    return Sighting(observation.keyframe, detection, share, tuple(modes), tuple(context), clutter), (viewpoint, time_s)
+    return Sighting(observation.keyframe, tuple(modes), tuple(context), clutter), (viewpoint, time_s)
 
 
 def _log_clutter(proposer: Proposer, view: View, modes: list[PoseModes | None]) -> float:

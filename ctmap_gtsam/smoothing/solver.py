@@ -30,7 +30,7 @@ class Solution:
     energy: float
     """graph.error at the values"""
     end: End
-    """converged: the energy fell by less than the tolerance; stalled: with any damping it rises; cap: out of iterations"""
+    """converged: the energy fell by less than the tolerance; stalled: any damping raises it; cap: out of iterations"""
     trace: tuple[float, ...]
     """energy at the start and after every accepted step"""
 

@@ -113,7 +113,6 @@ class GaussianProposer:
             np.zeros(n),
             np.zeros(n),
             np.array([self.covariance[i] for i in there]).reshape(n, 6, 6),
-            np.zeros((n, 6, 3)),
         )
 
     def score(self, shape, view, T):

@@ -156,14 +156,6 @@ def test_transform_acts_as_the_group_does(A, B, points):
     np.testing.assert_allclose(se3.transform(A, p), homogeneous[:, :3], atol=1e-13)
 
 
-@given(motions(), tangents(largest=3.0), st.floats(0, 1))
-def test_interpolation_goes_along_the_geodesic(A, xi, fraction):
-    B = se3.retract(A, xi)
-    np.testing.assert_allclose(se3.interpolate(A, B, 0.0), A, atol=1e-12)
-    np.testing.assert_allclose(se3.interpolate(A, B, 1.0), B, atol=1e-9)
-    np.testing.assert_allclose(se3.local(A, se3.interpolate(A, B, fraction)), fraction * xi, atol=1e-8)
-
-
 def test_uniform_rotations_are_uniform():
     n = 40_000
     R = se3.uniform_rotations(np.random.default_rng(0).random((n, 3)))
