@@ -100,7 +100,7 @@ def test_a_wall_carries_nothing_and_a_given_up_is_kept():
 
 
 def neighbour(i, shape, *where):
-    return Neighbour(i, shape, standing(shape, *where))
+    return Neighbour(i, shape, standing(shape, *where), log_evidence=0.0)
 
 
 def poses_near(seed, n=5):
@@ -126,7 +126,7 @@ def test_moving_the_whole_world_changes_nothing(seed):
     G = se3.exp(rng.normal(size=6))
     around = Surroundings((neighbour(1, BOX, 0.05, 0.03), neighbour(2, CAN, -0.1)), (surface(0.0), surface(0.02, 0.2)))
     moved = Surroundings(
-        tuple(Neighbour(n.object_id, n.shape, G @ n.T_world_centre) for n in around.neighbours),
+        tuple(replace(n, T_world_centre=G @ n.T_world_centre) for n in around.neighbours),
         tuple(s.moved(G) for s in around.supports),
     )
     poses = poses_near(seed)
@@ -196,7 +196,7 @@ def test_a_neighbours_pixels_are_its_own(sigma, share):
     proposer = Proposer(model)
     box = np.array(box_of(BOX, T[0]))
     alone = proposer.view(observation, box, None, Surroundings((), ()))
-    claimed = proposer.view(observation, box, None, Surroundings((Neighbour(1, BOX, pose),), ()))
+    claimed = proposer.view(observation, box, None, Surroundings((Neighbour(1, BOX, pose, 0.0),), ()))
     own, _ = proposer.score(BOX, alone, T)
     taken, _ = proposer.score(BOX, claimed, T)
     assert own[0] > 50.0
