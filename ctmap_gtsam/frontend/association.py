@@ -90,9 +90,10 @@ class Associator:
         predicted = np.stack([_predicted_box(t, frame) for t in self._tracks])
         boxes = np.array([d.box for d in detections])
         overlap = box_iou(predicted[:, None], boxes[None])
+        # what is too small counts nothing, or two that are too small could outweigh one that is not
+        overlap = np.where(overlap >= self._settings.association_iou, overlap, 0.0)
         rows, columns = linear_sum_assignment(-overlap)
-        least = self._settings.association_iou
-        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if overlap[r, c] >= least}
+        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if overlap[r, c] > 0.0}
 
     def _extend(self, track: _Open, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None

@@ -156,6 +156,22 @@ def test_what_is_said_of_the_past_doesnt_change_with_the_future(seed):
             assert track.detections == later[i].detections[: len(kept)]
 
 
+def test_a_good_match_is_not_given_up_for_two_bad_ones():
+    """Overlaps 0.6, 0.35, 0.35 and 0: the two that are too small are no reason to leave the one that is not."""
+    T = looking()
+    depth = depth_of([], T)
+
+    def keyframe(k, *lefts):
+        boxes = [Detection((float(x), 100.0, 100.0, 60.0), np.array([0.2, 0.5, 0.3])) for x in lefts]
+        return Observation(k, frame_of(k, T, depth, boxes), depth, ())
+
+    associator = Associator(replace(SETTINGS, start_after=1, association_iou=0.4))
+    associator.step(keyframe(0, 100.0, 172.0))
+    associator.step(keyframe(1, 124.0, 52.0))
+    kept = [t for t in associator.tracks() if len(t.keyframes) == 2]
+    assert [[d.box[0] for d in t.detections] for t in kept] == [[100.0, 124.0]]
+
+
 def test_a_box_without_depth_is_no_observation():
     T = looking()
     blind = Observation(0, frame_of(0, T, depth_of([], T), [box_at(SPOTS[0], T)]), np.zeros((240, 320), np.float32), ())
