@@ -1,6 +1,6 @@
 """Frames of things on a table, rendered: what the estimators are tried on where the answer is known."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -141,6 +141,7 @@ def small_run(
     seed: int = 0,
     seen: Callable[[int, str], bool] = lambda k, name: True,
     there: Callable[[int, str], bool] = lambda k, name: True,
+    moved: Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[Run, dict[str, np.ndarray]]:
     """A camera goes round a table with some things on it: the run, and T_world_object of each thing.
 
@@ -152,6 +153,7 @@ def small_run(
         seed: of the noise of depth, 1 mm, and boxes.
         seen: (frame, name) -> whether the detector finds it.
         there: (frame, name) -> whether it stands there.
+        moved: where some things stand from the second visit on; the truth is that of the first.
     """
     model = model_of(*names, *others)
     rng = np.random.default_rng(seed)
@@ -163,7 +165,10 @@ def small_run(
     for k in range(frames * visits):
         T_world_camera = looking(0.12 * (k % frames) - 0.3, 0.75, 0.75)
         T = se3.inverse(T_world_camera)
-        present = [(shape_named(model, name), placed[name]) for name in names if there(k, name)]
+        where = placed | {
+            name: standing(shape_named(model, name), *spot) for name, spot in (moved or {}).items() if k >= frames
+        }
+        present = [(shape_named(model, name), where[name]) for name in names if there(k, name)]
         depth = depth_of(present, T_world_camera)
         depth = (depth + (depth > 0) * 0.001 * rng.normal(size=depth.shape)).astype(np.float32)
         found = [detection_of(s, T @ pose, len(model.shapes)) for s, pose in present if seen(k, s.source.name)]

@@ -99,6 +99,20 @@ def test_a_thing_that_was_not_moved_between_visits_is_one_object():
     assert (estimate.moves.probability[between] < 0.05).all()
 
 
+def test_a_thing_that_was_moved_between_visits_is_one_object_that_moved():
+    run, truth = small_run(frames=4, visits=2, moved={"mug": (0.02, 0.2)})
+    estimate = smooth_run(run, CONFIG)
+    assert len(estimate.object_id) == len(truth)
+    assert (estimate.existence > 0.9).all()
+    mug = row_of(estimate, truth, "mug", 0)
+    step = estimate.pose[mug, 4, :3, 3] - estimate.pose[mug, 3, :3, 3]
+    assert np.linalg.norm(step[:2] - [0.1, 0.2]) < 0.05
+    own = (estimate.moves.object == mug) & (estimate.moves.gap[:, 0] == 3)
+    np.testing.assert_allclose(estimate.moves.probability[own], 1.0, atol=0.05)
+    other = (estimate.moves.object == 1 - mug) & (estimate.moves.gap[:, 0] == 3)
+    assert (estimate.moves.probability[other] < 0.05).all()
+
+
 def test_a_single_lying_score_vector_changes_nothing(scene):
     run, truth = scene
     lie = np.array([0.0, 0.0, 1.0, 0.0])  # a banana, surely
