@@ -130,7 +130,7 @@ class Updater:
         view = self.proposer.view(observation, np.array(detection.box), detection, around)
         n = len(self.model.shapes)
         score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
-        count = self.model.config.filter.particles // n
+        count = max(self.model.config.filter.particles // n, self.model.config.filter.min_particles)
         classes = []
         for shape in self.model.shapes:
             rng = self._rng("filter.start", track.track_id, observation, shape)
@@ -192,6 +192,7 @@ class Updater:
         for c, own in enumerate(belief.classes):
             if own is None or log_evidence[c] < log_evidence.max() - 3.0 * _LIKELY:
                 weighted.append(None)
+                context[c] = -np.inf  # too far behind to be looked at: its context can't make it the best
                 continue
             nats = around.log_potential(self.model, self.model.shapes[c], own.particles.T_world_centre)
             joint = own.particles.log_weight + nats
@@ -256,9 +257,9 @@ class Updater:
         stay = np.array([stay_probability(gap, s.source.persistence_s, r1, 1.0 - r1) for s in self.model.shapes])
         stay = np.where([s.source.movable for s in self.model.shapes], stay, 1.0)
         with np.errstate(divide="ignore"):
-            left = float(log_sum(total + np.log1p(-stay)))
+            left, log_stay = float(log_sum(total + np.log1p(-stay))), np.log(stay)
         classes = tuple(
-            None if own is None else replace(own, log_evidence=own.log_evidence + float(np.log(stay[c])))
+            None if own is None else replace(own, log_evidence=own.log_evidence + float(log_stay[c]))
             for c, own in enumerate(belief.classes)
         )
         return replace(belief, classes=classes, log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)))

@@ -59,12 +59,18 @@ def join_moved(things: Mapping[int, Thing], recording: Recording, model: Model) 
     if not vanished or not appeared:
         return joined
     score = np.array([[_match(a, b) for b in appeared] for a in vanished])
-    for row, column in zip(*linear_sum_assignment(-score), strict=True):
-        a, b = vanished[row], appeared[column]
-        if score[row, column] < _SAME_CLASS or a.object_id not in joined or b.object_id not in joined:
-            continue
-        joined[a.object_id] = _joined(a, b, recording, model)
+    pairs = [
+        (vanished[row], appeared[column])
+        for row, column in zip(*linear_sum_assignment(-score), strict=True)
+        if score[row, column] >= _SAME_CLASS
+    ]
+    became: dict[int, int] = {}
+    # in order of time, so that a chain of moves grows at its end
+    for a, b in sorted(pairs, key=lambda pair: (_first_present(pair[1]) or 0, pair[1].object_id)):
+        whole = became.get(a.object_id, a.object_id)
+        joined[whole] = _joined(joined[whole], b, recording, model)
         del joined[b.object_id]
+        became[b.object_id] = whole
     return joined
 
 
