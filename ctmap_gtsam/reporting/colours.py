@@ -11,7 +11,6 @@ RGB = tuple[int, int, int]
 
 FILTER = "#d55e00"
 SMOOTHER = "#0072b2"
-TRUTH = "#1b1b1b"
 QUIET = "#8a8f98"
 
 CLASSES: tuple[RGB, ...] = (
