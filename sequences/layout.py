@@ -92,7 +92,7 @@ def _no_scenes(root: Path) -> InputError:
             "this is a recording in the TUM RGB-D layout, not a BOP dataset",
             file=root,
             field="layout",
-            remedy=f"convert it: ctmap import tum {root} RUN",
+            remedy="convert it to a BOP dataset, as docs/run-layout.md describes",
         )
     if (root / SCENE_CAMERA).is_file():
         return InputError(

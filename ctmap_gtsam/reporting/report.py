@@ -119,7 +119,7 @@ def _verdict(name: str, metrics: Mapping[str, Any]) -> str:
         for key, word in (("missed_objects", "missed"), ("false_positive_objects", "false"))
         if metrics[key]
     ]
-    end = f"{' and '.join(mistakes)} objects" if mistakes else "nothing is missed, nothing invented"
+    end = f"objects: {' and '.join(mistakes)}" if mistakes else "nothing is missed, nothing invented"
     return f"{name} calls objects what they are in {100 * accuracy:.0f} % of the views; {far}; {end}"
 
 

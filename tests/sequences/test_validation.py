@@ -425,7 +425,7 @@ def test_a_tum_recording_is_recognised(data):
     inspection = inspect_run(data / "tum_cabinet")
     (problem,) = inspection.problems
     assert "TUM RGB-D layout, not a BOP dataset" in problem.message
-    assert "ctmap import tum" in problem.remedy
+    assert "docs/run-layout.md" in problem.remedy
 
 
 # --- what is there ---
