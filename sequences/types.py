@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,7 +97,7 @@ class Run:
     notes: tuple[str, ...] = ()
     """defaults that were derived because the data did not say, in words"""
 
-    @property
+    @cached_property
     def frames(self) -> tuple[Frame, ...]:
         """All frames of all visits in order."""
         return tuple(frame for visit in self.visits for frame in visit.frames)

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.frontend.association import Associator, Track
-from ctmap_gtsam.frontend.observation import Observation, observe
+from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from factors.mixture import log_sum
+from sequences.geometry import Plane
 from sequences.progress import Progress
 from sequences.seeds import generator
 from sequences.types import Detection, Run
@@ -35,12 +36,15 @@ class Recording:
     run: Run
     keyframes: NDArray[np.int64]
     """(K,) indices into Run.frames"""
+    planes: tuple[tuple[Plane, ...], ...]
+    """(K,) those of each keyframe's image, camera frame: found once, depth is read again each round"""
     tracks: tuple[Track, ...]
     place: Place
 
-    def observe(self, keyframe: int, seed: int) -> Observation:
+    def observe(self, keyframe: int) -> Observation:
         """Read a keyframe."""
-        return observe(self.run.frames[int(self.keyframes[keyframe])], keyframe, seed)
+        frame = self.run.frames[int(self.keyframes[keyframe])]
+        return Observation(keyframe, frame, frame.read_depth(), self.planes[keyframe])
 
     def T_world_camera(self, keyframe: int) -> Array:
         """(4, 4) as recorded."""
@@ -95,13 +99,14 @@ class Found:
 def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progress) -> Recording:
     """Associate boxes over the whole run, find the level surfaces and which way is up."""
     associator, place = Associator(model.config.frontend), Place(run)
+    planes: list[tuple[Plane, ...]] = []
     with progress.stage("tracks", total=len(keyframes)) as stage:
-        for k, index in enumerate(keyframes):
-            observation = observe(run.frames[int(index)], k, model.config.seed)
+        for observation in observations(run, keyframes, model.config.seed):
             associator.step(observation)
             place.update(observation)
+            planes.append(observation.planes)
             stage.advance()
-    return Recording(run, keyframes, associator.tracks(), place)
+    return Recording(run, keyframes, tuple(planes), associator.tracks(), place)
 
 
 def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[int, Found]:
@@ -115,7 +120,7 @@ def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[i
     }
     with progress.stage("search", total=sum(map(len, chosen.values()))) as stage:
         for k in at:
-            observation = recording.observe(k, model.config.seed)
+            observation = recording.observe(k)
             for track in recording.tracks:
                 if k not in chosen[track.track_id]:
                     continue
@@ -174,7 +179,7 @@ def gather(
     with progress.stage(name, total=len(recording.keyframes)) as stage:
         for k in range(len(recording.keyframes)):
             asked = {i: wish for i in tracks if (wish := wanted(i, k)) is not None}
-            observation = recording.observe(k, proposer.model.config.seed) if asked else None
+            observation = recording.observe(k) if asked else None
             for i, wish in asked.items():
                 assert observation is not None
                 detection = _detection(tracks[i], k)
