@@ -25,6 +25,7 @@ CAMERA, CATALOGUE, CTMAP = "camera.json", "catalogue.json", "ctmap.json"
 MODELS, MODELS_INFO = "models", "models_info.json"
 SCENE_CAMERA, SCENE_DETECTIONS = "scene_camera.json", "scene_detections.json"
 SCENE_GT, SCENE_GT_INFO, SCENE_CAMERA_GT = "scene_gt.json", "scene_gt_info.json", "scene_camera_gt.json"
+SCENE_GT_MOVES = "scene_gt_moves.json"
 DEPTH, COLOUR = "depth", ("rgb", "gray")
 SPLIT = "test"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

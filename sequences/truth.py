@@ -6,9 +6,10 @@ BOP's scene_gt.json says T_camera_object for the true camera, so T_world_object 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from sequences import layout, se3
 from sequences.errors import InputError
 from sequences.jsonfile import Node
 from sequences.problems import Checks
-from sequences.types import Frame, Run, TrueObject, Truth, Visit
+from sequences.types import Frame, MoveKind, Run, TrueMove, TrueObject, Truth, Visit
 
 Array = NDArray[np.float64]
 
@@ -32,7 +33,9 @@ class _Sighting:
     frame: int
     T_world_object: Array
     visible_fraction: float
-    file: Path
+    support: int
+    """inst_id, -1 where the file names none"""
+    node: Node
 
 
 def load_truth(run: Run) -> Truth | None:
@@ -42,9 +45,11 @@ def load_truth(run: Run) -> Truth | None:
       obj_id is taken to be one object in all frames of that visit, and another in each other visit.
     - scene_camera_gt.json holds the true camera poses in the visit's frame; without it the recorded ones count.
     - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing.
+    - Moves are those of scene_gt_moves.json. What they say of visits that the run doesn't have is left out.
 
     Raises:
-        InputError: broken files; unknown obj_id; an inst_id that names two objects of one frame, or two classes.
+        InputError: broken files; unknown obj_id; an inst_id that names two objects of one frame, or two classes; a
+            support that isn't there; a move of what isn't there, or at a time that isn't the visit's.
     """
     return read_truth(run, run.catalogue.obj_ids, Checks())
 
@@ -53,7 +58,7 @@ def read_truth(run: Run, obj_ids: Collection[int], checks: Checks) -> Truth | No
     """As `load_truth`; with gathering checks, the truth without the frames that are wrong, for `inspect_run` alone."""
     cameras = np.stack([frame.T_world_camera for frame in run.frames]) if run.frames else np.zeros((0, 4, 4))
     sightings: list[_Sighting] = []
-    found = False
+    found: list[tuple[int, Path]] = []
     for v, visit in enumerate(run.visits):
         if not visit.frames:
             continue
@@ -61,10 +66,17 @@ def read_truth(run: Run, obj_ids: Collection[int], checks: Checks) -> Truth | No
         with checks.part():
             cameras[[frame.index for frame in visit.frames]] = _true_cameras(folder, visit, checks)
         if (folder / layout.SCENE_GT).is_file():
-            found = True
+            found.append((v, folder))
             with checks.part():
                 sightings += _sightings(folder, v, visit, obj_ids, cameras, checks)
-    return Truth(_objects(sightings, checks), cameras) if found else None
+    if not found:
+        return None
+    objects = _objects(_on_known_supports(sightings, checks), checks)
+    moves: list[TrueMove] = []
+    for v, folder in found:
+        with checks.part():
+            moves += _moves(folder, v, run, {o.inst_id: o for o in objects}, checks)
+    return Truth(objects, cameras, tuple(sorted(moves, key=lambda move: move.time_ns)))
 
 
 def _true_cameras(folder: Path, visit: Visit, checks: Checks) -> Array:
@@ -121,7 +133,10 @@ def _sighting(
     if obj_id not in obj_ids:
         raise node["obj_id"].error(f"unknown obj_id {obj_id}", "add its model to models/, or remove the entry")
     T_camera_object = se3.make(layout.rotation(node["cam_R_m2c"]), node["cam_t_m2c"].numbers(3) * layout.MM)
-    return _Sighting(key(node, obj_id), obj_id, frame.index, cameras[frame.index] @ T_camera_object, visible, node.file)
+    T_world_object = cameras[frame.index] @ T_camera_object
+    support = node.get("support")
+    on = -1 if support is None else support.integer()
+    return _Sighting(key(node, obj_id), obj_id, frame.index, T_world_object, visible, on, node)
 
 
 def _named(node: Node, obj_id: int) -> tuple[int, ...]:
@@ -159,6 +174,21 @@ def _visible_fractions(folder: Path) -> Callable[[int, int], float]:
     return fraction
 
 
+def _on_known_supports(sightings: list[_Sighting], checks: Checks) -> list[_Sighting]:
+    """Those whose support is another object of the truth, or isn't named."""
+    known = {s.key for s in sightings if len(s.key) == 1}
+    good = []
+    for s in sightings:
+        with checks.part():
+            if s.support != -1 and ((s.support,) not in known or s.key == (s.support,)):
+                raise s.node["support"].error(
+                    f"no other object has inst_id {s.support}",
+                    "name the inst_id of what it stands on, or leave support out",
+                )
+            good.append(s)
+    return good
+
+
 def _objects(sightings: list[_Sighting], checks: Checks) -> tuple[TrueObject, ...]:
     by_key: dict[tuple[int, ...], list[_Sighting]] = {}
     for sighting in sightings:
@@ -178,7 +208,7 @@ def _object(inst_id: int, sightings: list[_Sighting]) -> TrueObject:
     if len(obj_ids) > 1:
         raise InputError(
             f"inst_id {inst_id} is of classes {obj_ids}",
-            file=sightings[-1].file,
+            file=sightings[-1].node.file,
             field="inst_id",
             remedy="give each physical object an inst_id of its own",
         )
@@ -188,4 +218,63 @@ def _object(inst_id: int, sightings: list[_Sighting]) -> TrueObject:
         frames=np.array([s.frame for s in sightings], dtype=np.int64),
         T_world_object=np.stack([s.T_world_object for s in sightings]),
         visible_fraction=np.array([s.visible_fraction for s in sightings]),
+        support=np.array([s.support for s in sightings], dtype=np.int64),
     )
+
+
+def _moves(folder: Path, v: int, run: Run, objects: Mapping[int, TrueObject], checks: Checks) -> list[TrueMove]:
+    file = folder / layout.SCENE_GT_MOVES
+    if not file.is_file():
+        return []
+    moves = []
+    for element in Node.read(file, "").elements():
+        with checks.part():
+            moves.append(_move(element, v, run, objects))
+    return moves
+
+
+def _move(node: Node, v: int, run: Run, objects: Mapping[int, TrueObject]) -> TrueMove:
+    kind = next((kind for kind in get_args(MoveKind) if kind == node["kind"].text()), None)
+    if kind is None:
+        raise node["kind"].error(f"unknown kind {node['kind'].text()}", f"write one of {', '.join(get_args(MoveKind))}")
+    move = TrueMove(
+        inst_id=node["inst_id"].integer(),
+        visit=v,
+        time_ns=_move_time(node["time_ns"], v, run, in_view=kind == "nudged"),
+        kind=kind,
+        from_support=_move_support(node.get("from_support"), v, objects),
+        to_support=_move_support(node.get("to_support"), v + 1, objects),
+    )
+    frames = objects[move.inst_id].frames if move.inst_id in objects else np.zeros(0, dtype=np.int64)
+    afterwards = [f for f in run.visits[v].frames if f.time_ns >= move.time_ns and f.index in frames]
+    if bool(afterwards) == (kind == "vanished"):
+        where = "still" if afterwards else "not"
+        raise node["inst_id"].error(
+            f"object {move.inst_id} {kind}, but is {where} in {layout.SCENE_GT} afterwards",
+            f"correct the move, or the entries of {layout.SCENE_GT}",
+        )
+    return move
+
+
+def _move_time(node: Node, v: int, run: Run, *, in_view: bool) -> int:
+    """After the visit before this one and not after this one; during this one where it was in view."""
+    time, frames = node.integer(), run.visits[v].frames
+    early = time < frames[0].time_ns if in_view else v > 0 and time <= run.visits[v - 1].frames[-1].time_ns
+    if early or time > frames[-1].time_ns:
+        raise node.error(
+            f"the time is not of visit {run.visits[v].scene_id}",
+            "write the time, UTC, and put the move into the visit that it happened in, or before",
+        )
+    return time
+
+
+def _move_support(node: Node | None, v: int, objects: Mapping[int, TrueObject]) -> int | None:
+    """An inst_id; what stands on something in a visit that the run doesn't have (v < 1) may stand on the unknown."""
+    if node is None:
+        return None
+    support = node.integer()
+    if support in objects:
+        return support
+    if v > 0:
+        raise node.error(f"no object has inst_id {support}", "name the inst_id of what it stood on, or leave it out")
+    return None

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 Colour = NDArray[np.uint8]
+MoveKind = Literal["moved", "nudged", "appeared", "vanished"]
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,25 @@ class TrueObject:
     """(n, 4, 4) at those frames, with the true camera pose"""
     visible_fraction: Array
     """(n,) visible share of the silhouette, 1 where scene_gt_info.json is missing"""
+    support: NDArray[np.int64]
+    """(n,) inst_id of the object that it stands on; -1 where that isn't known, or is none of the truth's objects"""
+
+
+@dataclass(frozen=True)
+class TrueMove:
+    """One thing that somebody did to a physical object, as scene_gt_moves.json has it."""
+
+    inst_id: int
+    visit: int
+    """position in Run.visits of the visit that it happened in, or else before, after the visit before that"""
+    time_ns: int
+    """UTC, nanoseconds"""
+    kind: MoveKind
+    """"moved" to another place; "nudged" where it stands, during a visit; "appeared" or "vanished" from the place"""
+    from_support: int | None
+    """inst_id of the object that it stood on; None where that isn't known, is none of the truth's, or it appeared"""
+    to_support: int | None
+    """the same of where it went; None where it vanished"""
 
 
 @dataclass(frozen=True)
@@ -124,3 +144,5 @@ class Truth:
     objects: tuple[TrueObject, ...]
     T_world_camera: Array
     """(F, 4, 4) the true camera poses, the recorded ones where scene_camera_gt.json is missing"""
+    moves: tuple[TrueMove, ...] = ()
+    """by time; empty where no visit has a scene_gt_moves.json"""

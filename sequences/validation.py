@@ -19,7 +19,7 @@ from sequences.classes import read_obj_ids
 from sequences.meshes import diameter
 from sequences.problems import Checks, Problem
 from sequences.truth import read_truth
-from sequences.types import Frame, Run, Visit
+from sequences.types import Frame, Run, Truth, Visit
 
 __all__ = ["ClassFacts", "Facts", "Inspection", "Problem", "VisitFacts", "inspect_run"]
 
@@ -32,6 +32,7 @@ _SCENE_FILES = (
     layout.SCENE_GT,
     layout.SCENE_GT_INFO,
     layout.SCENE_CAMERA_GT,
+    layout.SCENE_GT_MOVES,
 )
 
 
@@ -84,6 +85,7 @@ class Facts:
     """which files of the run are there"""
     has_truth: bool
     true_objects: int
+    true_moves: int
     up_world: tuple[float, ...] | None
     localisation: dict[str, float]
     """standard deviations of the recorded poses: rotation_rad, translation_m, correlation_time_s"""
@@ -130,7 +132,7 @@ def inspect_run(path: Path | str, scene: int | None = None) -> Inspection:
         _check_meshes(run, checks)
         for frame in run.frames:
             _check_images(frame, checks)
-        facts = _facts(run, 0 if truth is None else len(truth.objects), checks)
+        facts = _facts(run, truth, checks)
     problems = sorted(checks.problems, key=lambda p: p.severity != "error")
     return Inspection(root, facts, tuple(problems))
 
@@ -170,7 +172,7 @@ def _check_images(frame: Frame, checks: Checks) -> None:
             )
 
 
-def _facts(run: Run, true_objects: int, checks: Checks) -> Facts:
+def _facts(run: Run, truth: Truth | None, checks: Checks) -> Facts:
     frames = run.frames
     classes = run.catalogue.classes
     return Facts(
@@ -185,8 +187,9 @@ def _facts(run: Run, true_objects: int, checks: Checks) -> Facts:
         categories=tuple(sorted({c.category for c in classes})),
         detections_per_frame=_mean(len(frame.detections) for frame in frames),
         files={name: (run.path / name).is_file() for name in _FILES},
-        has_truth=true_objects > 0,
-        true_objects=true_objects,
+        has_truth=truth is not None and len(truth.objects) > 0,
+        true_objects=0 if truth is None else len(truth.objects),
+        true_moves=0 if truth is None else len(truth.moves),
         up_world=None if run.up_world is None else tuple(run.up_world.tolist()),
         localisation=asdict(run.localisation),
         derived=tuple(checks.notes),

@@ -21,7 +21,7 @@ from sequences.errors import InputError
 from sequences.images import encode_png
 from sequences.jsonfile import Node
 from sequences.meshes import encode_mesh
-from sequences.types import Detection, LocalisationNoise
+from sequences.types import Detection, LocalisationNoise, MoveKind
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -40,6 +40,8 @@ class Sighting:
     """(4, 4) metres"""
     visible_fraction: float
     """visible share of the silhouette"""
+    support: int | None = None
+    """inst_id of the object that it stands on; None where that isn't known, or is none of the truth's objects"""
 
 
 @dataclass(frozen=True)
@@ -191,6 +193,7 @@ class VisitWriter:
     _truth: Json = field(default_factory=dict)
     _truth_info: Json = field(default_factory=dict)
     _truth_cameras: Json = field(default_factory=dict)
+    _moves: list[Json] = field(default_factory=list)
 
     def add_frame(
         self,
@@ -236,6 +239,18 @@ class VisitWriter:
             self._truth[key] = [_sighting_json(s, truth.T_world_camera) for s in truth.sightings]
             self._truth_info[key] = [{"visib_fract": float(s.visible_fraction)} for s in truth.sightings]
 
+    def add_move(
+        self,
+        inst_id: int,
+        time_ns: int,
+        kind: MoveKind,
+        from_support: int | None = None,
+        to_support: int | None = None,
+    ) -> None:
+        """The truth about one move, made in this visit or between the one before and this; see `types.TrueMove`."""
+        supports = {"from_support": from_support, "to_support": to_support}
+        self._moves.append({"inst_id": inst_id, "time_ns": int(time_ns), "kind": kind, **supports})
+
     def finish(self) -> None:
         """Write the visit's JSON files."""
         write_json(self.folder / layout.SCENE_CAMERA, self._frames)
@@ -244,6 +259,8 @@ class VisitWriter:
             write_json(self.folder / layout.SCENE_GT, self._truth)
             write_json(self.folder / layout.SCENE_GT_INFO, self._truth_info)
             write_json(self.folder / layout.SCENE_CAMERA_GT, self._truth_cameras)
+        if self._moves:
+            write_json(self.folder / layout.SCENE_GT_MOVES, self._moves)
 
     def _pose_json(self, T_world_camera: Array) -> Json:
         T_camera_visit = se3.inverse(T_world_camera) @ self.T_world_visit
@@ -309,9 +326,10 @@ def _detection_json(detection: Detection, scene_id: int, im_id: int, catalogue: 
 
 def _sighting_json(sighting: Sighting, T_world_camera: Array) -> Json:
     T_camera_object = se3.inverse(T_world_camera) @ sighting.T_world_object
-    return {
+    out: Json = {
         "obj_id": sighting.obj_id,
         "inst_id": sighting.inst_id,
         "cam_R_m2c": T_camera_object[:3, :3].ravel().tolist(),
         "cam_t_m2c": (T_camera_object[:3, 3] / layout.MM).tolist(),
     }
+    return out if sighting.support is None else {**out, "support": sighting.support}

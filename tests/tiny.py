@@ -65,16 +65,21 @@ def _class(
 
 
 def write_tiny_run(target: Path, *, visits: int = 2, frames: int = 3, seed: int = 0, truth: bool = True) -> None:
-    """Scenes 1, 2, ... with images 1, 2, ..., two detections and two true objects a frame."""
+    """Scenes 1, 2, ... with images 1, 2, ..., two detections and two true objects a frame, one moved between visits."""
     rng = np.random.default_rng(seed)
     with RunWriter(
         target, tiny_catalogue(), source="tests", up_world=np.array([0.0, 0.0, 1.0]), localisation=NOISE
     ) as writer:
         for v in range(visits):
             visit = writer.add_visit(v + 1, se3.exp(rng.normal(size=6)))
+            if truth and v > 0:
+                visit.add_move(101, (1000 * v - 500) * SECOND, "moved", None, 105)
             for k in range(frames):
                 T_world_camera = se3.exp(rng.normal(size=6))
-                sightings = tuple(Sighting(100 + obj_id, obj_id, se3.exp(rng.normal(size=6)), 0.5) for obj_id in (1, 5))
+                sightings = tuple(
+                    Sighting(100 + obj_id, obj_id, se3.exp(rng.normal(size=6)), 0.5, support)
+                    for obj_id, support in ((1, 105), (5, None))
+                )
                 visit.add_frame(
                     k + 1,
                     (1000 * v + k) * SECOND,

@@ -26,7 +26,7 @@ def show_inspection(inspection: Inspection) -> None:
 
 
 def _show_facts(facts: Facts) -> None:
-    truth = f"known, {facts.true_objects} objects" if facts.has_truth else "not known"
+    truth = f"known, {facts.true_objects} objects, {facts.true_moves} moves" if facts.has_truth else "not known"
     up = "not given" if facts.up_world is None else " ".join(f"{x:.3f}" for x in facts.up_world)
     noise = ", ".join(f"{name} {value:g}" for name, value in facts.localisation.items())
     typer.echo(f"{facts.name}: {facts.frames} frames in {facts.duration_s:.1f} s; truth {truth}")

@@ -448,8 +448,11 @@ def test_facts_of_a_run(tiny_run_once):
     ]
     assert facts.categories == ("food", "furniture", "kitchen")
     assert all(facts.files.values())
-    assert all(all(visit.files.values()) for visit in facts.visits)
-    assert (facts.has_truth, facts.true_objects) == (True, 2)
+    assert [[name for name, there in visit.files.items() if not there] for visit in facts.visits] == [
+        ["scene_gt_moves.json"],
+        [],
+    ]
+    assert (facts.has_truth, facts.true_objects, facts.true_moves) == (True, 2, 1)
     assert facts.derived == ()
 
 
