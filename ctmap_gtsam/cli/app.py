@@ -1,4 +1,4 @@
-"""The `ctmap` application. Its commands, in `runs`, `estimators` and `tools`, import what they need when called."""
+"""The `ctmap` application. Its commands, in the modules beside this one, import what they need when called."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ctmap_gtsam.cli import estimators, runs, tools
+from ctmap_gtsam.cli import benches, estimators, runs, tools
 from ctmap_gtsam.cli.guard import GuardedGroup
 
 app = typer.Typer(
@@ -48,5 +48,5 @@ app.command()(estimators.smooth)
 app.command()(estimators.compare)
 app.command()(estimators.report)
 app.command()(tools.config)
-app.command()(tools.bench)
 app.add_typer(runs.simulate_app, name="simulate")
+app.add_typer(benches.bench_app, name="bench")

@@ -1,4 +1,4 @@
-"""Commands around the estimators: the demo, the settings, measurements of speed."""
+"""Commands around the estimators: the demo, the settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ctmap_gtsam.cli.estimators import compare_and_show
-from ctmap_gtsam.cli.options import Assignments, ConfigFile, JsonFile, Seed, settings, writable
+from ctmap_gtsam.cli.options import Assignments, ConfigFile, Seed, settings, writable
 from ctmap_gtsam.cli.runs import simulate_into
 
 DEMO_SETTINGS = Path(__file__).parent / "demo.toml"
@@ -43,26 +43,3 @@ def config(config_file: ConfigFile = None, assignments: Assignments = None, seed
     from ctmap_gtsam.runtime.settings import to_toml
 
     typer.echo(to_toml(settings(config_file, assignments, seed)), nl=False)
-
-
-def bench(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="What to measure: render.", show_default=False)],
-    json_file: JsonFile = None,
-    config_file: ConfigFile = None,
-    assignments: Assignments = None,
-    seed: Seed = None,
-) -> None:
-    """Measure speed on this machine and print the figures.
-
-    Example: `ctmap bench render --json render.json`
-    """
-    from ctmap_gtsam.bench import run_bench
-    from ctmap_gtsam.runtime.progress import RichProgress
-    from sequences.atomic import write_json
-
-    with RichProgress() as progress:
-        result = run_bench(name, settings(config_file, assignments, seed), progress)
-    for figure, value in result["figures"].items():
-        typer.echo(f"{figure} {value:.6g}" if isinstance(value, float) else f"{figure} {value}")
-    if json_file is not None:
-        write_json(json_file, result)

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from ctmap_gtsam.bench import run_bench
 from ctmap_gtsam.cli.app import app
-from ctmap_gtsam.config import load_config
+from ctmap_gtsam.config import Config, load_config
+from sequences.errors import InputError
 
 COMMANDS = [
     ["demo"],
@@ -18,7 +20,7 @@ COMMANDS = [
     ["smooth"],
     ["compare"],
     ["report"],
-    ["bench"],
+    ["bench", "render"],
 ]
 HEAVY = ("cv2", "gtsam", "numba", "numpy", "open3d", "pandas", "pyrender", "scipy", "trimesh")
 
@@ -110,7 +112,9 @@ def test_inspect_exits_with_2_and_names_every_problem(tmp_path: Path) -> None:
 
 
 def test_an_unknown_measurement_names_those_there_are() -> None:
-    assert_clean_error(ctmap("bench", "nothing"), "render")
+    with pytest.raises(InputError) as caught:
+        run_bench("nothing", Config())
+    assert "render" in caught.value.remedy
 
 
 def test_a_measurement_prints_what_it_writes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
