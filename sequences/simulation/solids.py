@@ -18,6 +18,8 @@ Solid = tuple[Array, NDArray[np.int32]]
 """vertices (V, 3), metres, and faces (F, 3)"""
 Paint = Callable[[Array], Array]
 """vertices (V, 3) -> colours (V, 3), 0 to 255"""
+Mask = Callable[[Array], NDArray[np.bool_]]
+"""vertices (V, 3) -> whether each belongs (V,)"""
 
 SEAM_M = 2e-4  # between the two rows of vertices where colours change
 
@@ -88,6 +90,127 @@ def _tube_faces(rings: int, segments: int) -> NDArray[np.int32]:
     top, pole = (rings - 1) * segments, np.full(segments, rings * segments)
     parts = [(a, b, d), (a, d, c), (following, rim, pole), (top + rim, top + following, pole + 1)]
     return np.concatenate([np.stack(part, axis=-1) for part in parts]).astype(np.int32)
+
+
+def ring(profile: Sequence[Sequence[float]], segments: int = 36) -> Solid:
+    """Turn a closed outline about z that stays off the axis: a roll, a ring.
+
+    Args:
+        profile: (n, 2) radius and height, metres, running so that the solid lies to the left.
+        segments: corners of each circle.
+    """
+    points = np.asarray(profile, dtype=np.float64)
+    n = len(points)
+    angle = 2.0 * np.pi * np.arange(segments) / segments
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    heights = np.broadcast_to(points[:, None, 1:], (n, segments, 1))
+    vertices = np.concatenate([points[:, None, :1] * circle, heights], axis=-1).reshape(-1, 3)
+    row, k = np.meshgrid(np.arange(n), np.arange(segments), indexing="ij")
+    following, turned = (row + 1) % n, (k + 1) % segments
+    a, b = (row * segments + k).ravel(), (row * segments + turned).ravel()
+    c, d = (following * segments + k).ravel(), (following * segments + turned).ravel()
+    return vertices, np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).astype(np.int32)
+
+
+def loft(sections: ArrayLike) -> Solid:
+    """A skin over cross-sections, closed by a fan from the middle of the first and of the last.
+
+    Args:
+        sections: (m, n, 3) outlines of equally many corners, each seen whole from its middle.
+    """
+    rings = np.asarray(sections, dtype=np.float64)
+    m, n = rings.shape[:2]
+    poles = rings[[0, -1]].mean(axis=1)
+    return oriented((np.concatenate([rings.reshape(-1, 3), poles]), _tube_faces(m, n)))
+
+
+def stacked(levels: Sequence[Sequence[float]], power: float = 2.0, segments: int = 32) -> Solid:
+    """A skin over level cross-sections that are superellipses |x / a|^p + |y / b|^p = 1.
+
+    Args:
+        levels: (m, 3) half width a, half depth b and height z, metres; two more numbers shift a section in x and y.
+        power: p: 2 is an ellipse, 4 a square with well-rounded corners.
+        segments: corners of each section, spread evenly by direction.
+    """
+    sections = []
+    for a, b, z, *shift in levels:
+        x, y = [*shift, 0.0, 0.0][:2]
+        outline = superellipse(a, b, power, segments)
+        sections.append(np.concatenate([outline + np.array([x, y]), np.full((segments, 1), z)], axis=-1))
+    return loft(sections)
+
+
+def superellipse(a: float, b: float, power: float, segments: int = 32) -> Array:
+    """(segments, 2) corners of |x / a|^p + |y / b|^p = 1, counter-clockwise."""
+    angle = 2.0 * np.pi * (np.arange(segments) + 0.5) / segments
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    reach = (np.abs(direction) ** power).sum(axis=-1, keepdims=True) ** (-1.0 / power)
+    return direction * reach * (a, b)
+
+
+def puff(size: ArrayLike, swell: Callable[[Array], Array], rings: int = 18, segments: int = 36) -> Solid:
+    """An ellipsoid whose surface swells and sinks.
+
+    Args:
+        size: (3,) its measures without the swell, metres.
+        swell: unit directions (n, 3) from the middle -> (n,) factors on the reach that way.
+        rings: circles of latitude.
+        segments: corners of each.
+    """
+    tilt = np.pi * (np.arange(rings + 2)[1:-1] / (rings + 1) - 0.5)
+    turn = 2.0 * np.pi * np.arange(segments) / segments
+    t, u = np.meshgrid(tilt, turn, indexing="ij")
+    walls = np.stack([np.cos(t) * np.cos(u), np.cos(t) * np.sin(u), np.sin(t)], axis=-1).reshape(-1, 3)
+    directions = np.concatenate([walls, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
+    vertices: Array = directions * swell(directions)[:, None] * (np.asarray(size, dtype=np.float64) / 2.0)
+    return vertices, _tube_faces(rings, segments)
+
+
+def block(size: ArrayLike, at: ArrayLike = (0.0, 0.0, 0.0)) -> Solid:
+    """A sharp-edged box of 12 faces, for keys, legs and the like."""
+    half = np.asarray(size, dtype=np.float64) / 2.0
+    return moved(_box_grid([np.array([-h, h]) for h in half]), at)
+
+
+def scored(solid: Solid, axis: int | ArrayLike, places: Sequence[float]) -> Solid:
+    """The same surface with two rows of vertices along planes, where colours may then change sharply.
+
+    Args:
+        solid: what to score.
+        axis: 0, 1 or 2, or a normal (3,), of the planes.
+        places: where the planes meet the axis, metres.
+    """
+    normal = np.eye(3)[axis] if isinstance(axis, int) else np.asarray(axis, dtype=np.float64)
+    for place in places:
+        for side in (-0.5, 0.5):
+            solid = _split(solid, normal, place + side * SEAM_M)
+    return solid
+
+
+def _split(solid: Solid, normal: Array, place: float) -> Solid:
+    """Cut the faces that a plane crosses into pieces on either side of it."""
+    vertices, faces = solid
+    level = vertices @ normal - place
+    level[np.abs(level) < 1e-6] = 0.0  # such a vertex counts as on the plane: no slivers
+    side = np.sign(level)[faces]
+    on, alone = side == 0.0, side * np.roll(side, 1, axis=1) + side * np.roll(side, -1, axis=1) == -2.0
+    # the corner that lies alone on its side of the plane, or on the plane itself, comes first
+    lone = np.argmax(np.where(on.any(axis=1)[:, None], on, alone), axis=1)
+    crossed = (side.min(axis=1) < 0) & (side.max(axis=1) > 0)
+    turned = np.take_along_axis(faces, (lone[:, None] + np.arange(3)) % 3, axis=1)
+    through = crossed & (level[turned[:, 0]] == 0.0)  # the plane passes through the first corner
+    across = crossed & ~through
+    a, b, c = turned[across].T
+    d, e, f = turned[through].T
+    start, end = np.concatenate([a, a, e]), np.concatenate([b, c, f])
+    edges, cut = np.unique(np.sort(np.stack([start, end], -1), axis=-1), axis=0, return_inverse=True)
+    low, high = level[edges[:, 0]], level[edges[:, 1]]
+    share = (low / (low - high))[:, None]
+    points = (1.0 - share) * vertices[edges[:, 0]] + share * vertices[edges[:, 1]]
+    p, q, r = np.split(len(vertices) + cut.reshape(-1), [len(a), 2 * len(a)])
+    pieces = [(a, p, q), (p, b, c), (p, c, q), (d, e, r), (d, r, f)]
+    new = np.concatenate([faces[~crossed], *(np.stack(piece, -1) for piece in pieces)])
+    return np.concatenate([vertices, points]), new.astype(np.int32)
 
 
 def rounded_box(
@@ -187,6 +310,12 @@ def plain(colour: ArrayLike) -> Paint:
     return lambda vertices: np.broadcast_to(np.asarray(colour, dtype=np.float64), vertices.shape)
 
 
+def baked(paint: Paint, solid: Solid) -> Paint:
+    """The colours that a paint gives a solid where it is now, kept when the solid is moved."""
+    colours = paint(solid[0])
+    return lambda _: colours
+
+
 def bands(axis: int, limits: Sequence[float], colours: Sequence[Sequence[float]]) -> Paint:
     """Colours by the coordinate along an axis; one more colour than limits."""
     table = np.asarray(colours, dtype=np.float64)
@@ -207,3 +336,48 @@ def assemble(parts: Sequence[tuple[Solid, Paint]]) -> Mesh:
     mesh = join(parts)
     centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
     return Mesh(mesh.vertices - centre, mesh.faces, mesh.colours)
+
+
+def within(
+    x: tuple[float, float] | None = None,
+    y: tuple[float, float] | None = None,
+    z: tuple[float, float] | None = None,
+) -> Mask:
+    """Whether a vertex lies between the limits along each axis."""
+    limits = [(axis, limit) for axis, limit in enumerate((x, y, z)) if limit is not None]
+
+    def mask(vertices: Array) -> NDArray[np.bool_]:
+        inside = np.ones(len(vertices), dtype=bool)
+        for axis, (low, high) in limits:
+            inside &= (vertices[:, axis] > low) & (vertices[:, axis] < high)
+        return inside
+
+    return mask
+
+
+def printed(ground: ArrayLike | Paint, *patches: tuple[Mask, ArrayLike | Paint]) -> Paint:
+    """A ground with patches on it, the later ones over the earlier."""
+
+    def colours_of(layer: ArrayLike | Paint, vertices: Array) -> Array:
+        return layer(vertices) if callable(layer) else np.asarray(layer, dtype=np.float64)
+
+    def paint(vertices: Array) -> Array:
+        colours = np.array(np.broadcast_to(colours_of(ground, vertices), vertices.shape), dtype=np.float64)
+        for mask, layer in patches:
+            inside = mask(vertices)
+            colours[inside] = np.broadcast_to(colours_of(layer, vertices), vertices.shape)[inside]
+        return colours
+
+    return paint
+
+
+def grained(colour: ArrayLike, depth: float, axis: int = 0) -> Paint:
+    """Wood whose streaks run along an axis; needs no random numbers."""
+    along, across, through = (axis, (axis + 1) % 3, (axis + 2) % 3)
+
+    def paint(vertices: Array) -> Array:
+        wave = 3.0 * np.sin(5.0 * vertices[:, along])
+        streak = np.sin(61.0 * vertices[:, across] + wave) + np.sin(23.0 * vertices[:, through])
+        return np.asarray(colour) * (1.0 + depth * streak[:, None])
+
+    return paint

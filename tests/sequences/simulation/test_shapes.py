@@ -1,4 +1,5 @@
 import itertools
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -38,9 +39,12 @@ def cube_rotations() -> list[np.ndarray]:
 
 def test_the_catalogue_is_a_household():
     small = [s.object_class for s in SHAPES if s.object_class.movable]
-    assert len(small) >= 8
-    assert len({c.category for c in small}) >= 4
-    assert [s.object_class.name for s in SHAPES if s.object_class.supports] == ["table", "shelf"]
+    assert len(small) >= 18
+    assert all(n >= 2 for n in Counter(c.category for c in small).values())
+    assert {c.category for c in small} >= {"food", "kitchen", "bath", "cleaning", "office", "tool"}
+    large = [s.object_class.name for s in SHAPES if s.object_class.supports]
+    assert set(large) >= {"table", "desk", "side_table", "cabinet", "shelf", "sofa", "chair"}
+    assert [s.object_class.name for s in SHAPES[-len(large) :]] == large
     classes = catalogue(tuple(reversed(SHAPES))).classes
     assert [c.obj_id for c in classes] == sorted({s.object_class.obj_id for s in SHAPES})
     assert len({c.name for c in classes}) == len(classes)
@@ -54,7 +58,8 @@ def test_meshes_are_closed_solids_of_moderate_size(shape):
     assert solid.is_winding_consistent
     assert solid.volume > 0
     assert solid.area_faces.min() > 0
-    assert 300 <= len(mesh.faces) <= (1800 if shape.object_class.movable else 2600)
+    assert mesh.is_solid
+    assert 300 <= len(mesh.faces) <= (1800 if shape.object_class.movable else 4200)
     assert len(np.unique(mesh.colours, axis=0)) >= 2
 
 
