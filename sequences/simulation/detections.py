@@ -8,7 +8,6 @@ constants below.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from sequences.catalogue import Catalogue, ObjectClass
 from sequences.seeds import generator
 from sequences.simulation.config import DetectorConfig
+from sequences.simulation.visibility import Visible
 from sequences.types import Detection
 
 Array = NDArray[np.float64]
@@ -31,25 +31,6 @@ STRETCH = 8.0  # ... for so many images on end, on average
 CERTAINTY = 5.0  # lead of the believed class in log odds at noise 1, right or wrong: overconfident
 SURE = 12.0  # the same at noise 0
 RESEMBLANCE = 6.0  # how strongly confusion prefers classes of like size
-
-
-@dataclass(frozen=True)
-class Visible:
-    """One thing as an image shows it."""
-
-    inst_id: int
-    obj_id: int
-    box: tuple[float, float, float, float]
-    """x, y, width, height of its visible pixels"""
-    fraction: float
-    """visible share of its silhouette, the part outside the image included: BOP's visib_fract"""
-    unoccluded: float
-    """visible share of the part of its silhouette that lies in the image"""
-
-    @property
-    def evidence(self) -> float:
-        """How much of it there is to recognise, 0 to 1: to be cut by the image's edge harms less than to be hidden."""
-        return float(np.sqrt(self.fraction * self.unoccluded))
 
 
 class Detector:

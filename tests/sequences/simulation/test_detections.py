@@ -13,10 +13,10 @@ from sequences.simulation.detections import (
     MISSED,
     STRETCH,
     Detector,
-    Visible,
     detection_probability,
 )
 from sequences.simulation.shapes import catalogue, household
+from sequences.simulation.visibility import Visible
 from sequences.types import Detection
 
 CLASSES = catalogue(household())
