@@ -21,9 +21,11 @@ import factors
 import sequences
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.evaluation.comparison import DETECTOR, Comparison, compare
+from ctmap_gtsam.evaluation.comparison import Comparison, compare
 from ctmap_gtsam.evaluation.outcome import Outcome
-from ctmap_gtsam.export import bop_csv, coco_detections, coco_results, views
+from ctmap_gtsam.evaluation.record import DETECTOR
+from ctmap_gtsam.evaluation.views import views
+from ctmap_gtsam.export import bop_csv, coco_detections, coco_results
 from ctmap_gtsam.reporting.report import render
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.versions import versions

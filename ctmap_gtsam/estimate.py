@@ -7,7 +7,6 @@ same input, configuration and seed give the same bytes.
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 import zlib
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sequences import se3
-from sequences.atomic import write_bytes
+from sequences.atomic import write_npz
 from sequences.errors import InputError
 
 Array = NDArray[np.float64]
@@ -194,7 +193,7 @@ class Estimate:
 
     def save(self, path: Path) -> None:
         """Write one .npz, whole or not at all, with fixed time stamps."""
-        write_bytes(path, _pack(self))
+        write_npz(path, _arrays(self))
 
     @classmethod
     def load(cls, path: Path) -> Estimate:
@@ -243,7 +242,7 @@ def _unpack(arrays: dict[str, Any], meta: dict[str, Any]) -> Estimate:
     return Estimate(**arrays, **parts, meta=meta)
 
 
-def _pack(estimate: Estimate) -> bytes:
+def _arrays(estimate: Estimate) -> dict[str, Any]:
     arrays: dict[str, Any] = {}
     for f in fields(estimate):
         value = getattr(estimate, f.name)
@@ -253,11 +252,4 @@ def _pack(estimate: Estimate) -> bytes:
             arrays |= {f"{f.name}.{g.name}": getattr(value, g.name) for g in fields(value)}
         else:
             arrays[f.name] = value
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in sorted(arrays):
-            data = io.BytesIO()
-            np.lib.format.write_array(data, np.asanyarray(arrays[name]), allow_pickle=False)
-            # np.savez stamps the time of day; two equal estimates must be equal to the byte
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), data.getvalue())
-    return buffer.getvalue()
+    return arrays

@@ -1,5 +1,7 @@
 """Estimates held to the truth, and to each other."""
 
+from ctmap_gtsam.evaluation.ceiling import truth_estimate
 from ctmap_gtsam.evaluation.comparison import Comparison, compare
+from ctmap_gtsam.evaluation.record import Record, pooled, record
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison", "Record", "compare", "pooled", "record", "truth_estimate"]

@@ -1,9 +1,7 @@
 """Methods side by side on one run: every metric of every method, from their estimates alone.
 
-A method is judged by each frame's own estimate, over all visible true object-frames. A true object that nothing
-matches, or whose match is absent in the frame, has infinite error. So has, in all that compares meshes, a match of the
-wrong class (its pose is in another mesh's frame), while its translation, between the boxes' centres, stays finite.
-A median is infinite where half of the object-frames are; in JSON, which knows no infinity, that is null.
+A method is judged by each frame's own estimate first, see `frames`; all figures are those of its `record`. In JSON,
+which knows no infinity, what is infinite is null.
 """
 
 from __future__ import annotations
@@ -17,18 +15,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.evaluation import detection, pose
 from ctmap_gtsam.evaluation.agreement import Agreement, agree
-from ctmap_gtsam.evaluation.matching import (
-    Matching,
-    MethodMap,
-    ObjectFrames,
-    from_estimate,
-    from_truth,
-    match,
-    shapes_of,
-)
+from ctmap_gtsam.evaluation.frames import POSES, FrameErrors, class_metrics, pose_metrics
+from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames, from_estimate, shapes_of
 from ctmap_gtsam.evaluation.pose import Shape
+from ctmap_gtsam.evaluation.record import DETECTOR, METRICS, Judge, Judgement, Record, own_counts, pooled
 from sequences.catalogue import Catalogue
 from sequences.truth import load_truth
 from sequences.types import Run
@@ -37,49 +28,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-DETECTOR = "detector"
-"""Name of the row that judges the recorded boxes, which have no poses"""
-
 REFERENCE = "smooth-ct"
 """The method that the others are held to where they are compared with each other"""
-
-METRICS = (
-    "mssd_mm_median",
-    "adds_mm_median",
-    "add_mm_median",
-    "translation_mm_median",
-    "rotation_deg_median",
-    "posed_share",
-    "class_accuracy",
-    "class_accuracy_last_half",
-)
-"""Taken over the visible true object-frames, of all objects and of each. posed_share: how many of them have a pose of
-the true class. class_accuracy_last_half: over the second half of the run's frames"""
-
-COUNTS = ("missed_objects", "false_positive_objects")
-"""True objects, visible somewhere, that nothing matches; estimated objects, existing somewhere, that match nothing"""
-
-
-@dataclass(frozen=True)
-class FrameErrors:
-    """One method at every true object (N) and frame (F): inf where it has no answer, NaN where nothing is asked."""
-
-    class_id: Ints
-    """(N, F) what the method says, -1 where it says nothing"""
-    class_correct: Bools
-    """(N, F)"""
-    class_probability: Array
-    """(N, F) P(exists) P(true class)"""
-    translation_m: Array
-    """(N, F) between the bounding boxes' centres"""
-    rotation_rad: Array
-    """(N, F) symmetry-aware"""
-    mssd_m: Array
-    """(N, F)"""
-    add_m: Array
-    """(N, F)"""
-    adds_m: Array
-    """(N, F)"""
 
 
 @dataclass(frozen=True)
@@ -93,6 +43,8 @@ class MethodScore:
     """None without truth, and for the detector"""
     matching: Matching | None
     """rows of the estimate for the true objects; None without truth, and for the detector"""
+    record: Record | None
+    """what the metrics are made from, to be pooled with other runs; None without truth"""
 
 
 @dataclass(frozen=True)
@@ -155,13 +107,12 @@ def compare(run: Run, estimates: Mapping[str, Estimate], detector: bool = True) 
     Returns:
         The comparison; without truth the metrics that need it are None.
     """
-    shapes = shapes_of(run.catalogue)
     truth = load_truth(run)
-    true_objects = None if truth is None else from_truth(run, truth)
-    labels = () if true_objects is None else object_labels(run.catalogue, true_objects)
+    judge = None if truth is None else Judge(run, truth)
+    labels = () if judge is None else object_labels(run.catalogue, judge.objects)
     maps = {name: from_estimate(run, name, estimate) for name, estimate in estimates.items()}
-    methods = {DETECTOR: _score_detector(run, true_objects, labels)} if detector else {}
-    methods |= {name: _score(one, true_objects, labels, shapes) for name, one in maps.items()}
+    asked: dict[str, MethodMap | None] = {**({DETECTOR: None} if detector else {}), **maps}
+    methods = {name: _judged(judge, one, labels) for name, one in asked.items()}
     reference = REFERENCE if REFERENCE in maps else next(reversed(maps), None)
     times = np.array([frame.time_ns for frame in run.frames], dtype=np.int64)
     return Comparison(
@@ -170,13 +121,24 @@ def compare(run: Run, estimates: Mapping[str, Estimate], detector: bool = True) 
         visit=np.array([frame.visit for frame in run.frames], dtype=np.int64),
         labels=labels,
         class_names={c.obj_id: c.name for c in run.catalogue.classes},
-        truth=true_objects,
+        truth=None if judge is None else judge.objects,
         methods=methods,
         reference=reference,
-        agreement={name: agree(maps[reference], other, shapes) for name, other in maps.items() if name != reference}
-        if reference is not None
-        else {},
+        agreement=_agreements(maps, reference, shapes_of(run.catalogue)),
     )
+
+
+def _agreements(maps: Mapping[str, MethodMap], reference: str | None, shapes: dict[int, Shape]) -> dict[str, Agreement]:
+    if reference is None:
+        return {}
+    return {name: agree(maps[reference], other, shapes) for name, other in maps.items() if name != reference}
+
+
+def _judged(judge: Judge | None, method: MethodMap | None, labels: tuple[str, ...]) -> MethodScore:
+    """The score of a method, None for the detector."""
+    if judge is None:
+        return _score_without_truth(None if method is None else method.estimate)
+    return _score(judge.detector() if method is None else judge.estimate(method), judge.objects.visible, labels)
 
 
 def object_labels(catalogue: Catalogue, truth: ObjectFrames) -> tuple[str, ...]:
@@ -188,102 +150,22 @@ def object_labels(catalogue: Catalogue, truth: ObjectFrames) -> tuple[str, ...]:
     )
 
 
-def _score(
-    method: MethodMap, truth: ObjectFrames | None, labels: tuple[str, ...], shapes: dict[int, Shape]
-) -> MethodScore:
-    estimate = method.estimate
-    own = {
-        "existing_objects_final": int(estimate.exists[:, -1].sum()) if len(estimate.keyframe_frame) else 0,
-        "hypotheses_scored": estimate.meta.get("diagnostics", {}).get("hypotheses_scored"),
-    }
-    if truth is None:
-        return MethodScore({**dict.fromkeys((*METRICS, *COUNTS)), **own, "objects": {}}, None, None)
-    matching = match(truth, method.objects, shapes)
-    errors = _frame_errors(method, truth, matching, shapes)
-    counts = {
-        "missed_objects": int(((matching.row < 0) & truth.visible.any(axis=1)).sum()),
-        "false_positive_objects": len(matching.unmatched),
-    }
-    metrics = {**_metrics(errors, truth.visible), **counts, **own, "objects": _by_object(errors, truth.visible, labels)}
-    return MethodScore(metrics, errors, matching)
+def _score_without_truth(estimate: Estimate | None) -> MethodScore:
+    counts = {} if estimate is None else own_counts(estimate)
+    return MethodScore({**dict.fromkeys(METRICS), **counts, "objects": {}}, None, None, None)
 
 
-def _frame_errors(method: MethodMap, truth: ObjectFrames, matching: Matching, shapes: dict[int, Shape]) -> FrameErrors:
-    said = detection.matched_class(method.objects, matching)
-    translation, rotation, mssd, add, adds = (np.where(truth.visible, np.inf, np.nan) for _ in range(5))
-    for n, row in enumerate(matching.row):
-        for true_id, said_id in np.unique(np.stack([truth.class_id[n], said[n]], axis=1), axis=0):
-            f = truth.visible[n] & (truth.class_id[n] == true_id) & (said[n] == said_id)
-            if said_id < 0 or not f.any():
-                continue
-            true, other = shapes[int(true_id)], shapes[int(said_id)]
-            T_true, T = truth.T_camera_object[n, f], method.objects.T_camera_object[row, f]
-            translation[n, f] = pose.translation_error(other, T, true, T_true)
-            if said_id == true_id:
-                rotation[n, f] = pose.rotation_error(true, T, T_true)
-                mssd[n, f], add[n, f], adds[n, f] = (e(true, T, T_true) for e in (pose.mssd, pose.add, pose.adds))
-    probability = [
-        detection.class_probability(method, int(row), truth.class_id[n]) for n, row in enumerate(matching.row)
-    ]
-    return FrameErrors(
-        class_id=said,
-        class_correct=detection.class_correct(truth, method.objects, matching),
-        class_probability=np.array(probability).reshape(truth.visible.shape),
-        translation_m=translation,
-        rotation_rad=rotation,
-        mssd_m=mssd,
-        add_m=add,
-        adds_m=adds,
-    )
+def _score(judgement: Judgement, visible: Bools, labels: tuple[str, ...]) -> MethodScore:
+    record, errors, matching = judgement
+    objects = {label: _object_metrics(errors, visible, n, record.posed) for n, label in enumerate(labels)}
+    metrics = {**pooled([record]), "objects": objects}
+    return MethodScore(metrics, errors if record.posed else None, matching, record)
 
 
-def _score_detector(run: Run, truth: ObjectFrames | None, labels: tuple[str, ...]) -> MethodScore:
-    empty = dict.fromkeys((*METRICS, *COUNTS, "existing_objects_final", "hypotheses_scored"))
-    if truth is None:
-        return MethodScore({**empty, "false_positive_boxes": None, "objects": {}}, None, None)
-    score = detection.score_detections(run, truth)
-    objects = {
-        label: {**dict.fromkeys(METRICS), **_class_metrics(score.class_correct[n : n + 1], truth.visible[n : n + 1])}
-        for n, label in enumerate(labels)
-    }
-    metrics = {**empty, **_class_metrics(score.class_correct, truth.visible), "false_positive_boxes": score.false_boxes}
-    return MethodScore({**metrics, "objects": objects}, None, None)
-
-
-def _by_object(errors: FrameErrors, visible: Bools, labels: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    rows = ((label, slice(n, n + 1)) for n, label in enumerate(labels))
-    return {
-        label: _metrics(FrameErrors(**{f.name: getattr(errors, f.name)[n] for f in fields(errors)}), visible[n])
-        for label, n in rows
-    }
-
-
-def _metrics(errors: FrameErrors, visible: Bools) -> dict[str, float | None]:
-    """The METRICS over the object-frames that count."""
-    return {
-        "mssd_mm_median": _median(1e3 * errors.mssd_m[visible]),
-        "adds_mm_median": _median(1e3 * errors.adds_m[visible]),
-        "add_mm_median": _median(1e3 * errors.add_m[visible]),
-        "translation_mm_median": _median(1e3 * errors.translation_m[visible]),
-        "rotation_deg_median": _median(np.rad2deg(errors.rotation_rad[visible])),
-        "posed_share": _mean(np.isfinite(errors.mssd_m[visible])),
-        **_class_metrics(errors.class_correct, visible),
-    }
-
-
-def _class_metrics(correct: Bools, visible: Bools) -> dict[str, float | None]:
-    half = visible.shape[1] // 2
-    return {
-        "class_accuracy": _mean(correct[visible]),
-        "class_accuracy_last_half": _mean(correct[:, half:][visible[:, half:]]),
-    }
-
-
-def _median(values: Array) -> float | None:
-    """None where there are no values, or where half of them are infinite."""
-    middle = float(np.median(values)) if len(values) else np.inf
-    return middle if np.isfinite(middle) else None
-
-
-def _mean(values: NDArray[Any]) -> float | None:
-    return float(np.mean(values)) if len(values) else None
+def _object_metrics(errors: FrameErrors, visible: Bools, n: int, posed: bool) -> dict[str, float | None]:
+    """The metrics of one true object over the frames where it is visible."""
+    only = np.zeros_like(visible)
+    only[n] = visible[n]
+    own = errors.at(only)
+    poses: Mapping[str, float | None] = pose_metrics(own) if posed else dict.fromkeys(POSES)
+    return {**poses, **class_metrics(own)}

@@ -13,28 +13,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from ctmap_gtsam.evaluation.boxes import IOU, TrueBoxes
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
-from ctmap_gtsam.evaluation.silhouettes import silhouettes
-from sequences.camera import Camera
-from sequences.catalogue import Catalogue
-from sequences.types import Detection, Run
+from ctmap_gtsam.evaluation.silhouettes import Box
+from sequences.types import Run
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-IOU = 0.5
-"""Two boxes are of one thing from this overlap on"""
 
 
 class DetectorScore(NamedTuple):
     """How the detector's own boxes fare against the boxes of the true objects."""
 
-    class_correct: Bools
-    """(N, F) true objects that have a box, called what they are"""
+    class_id: NDArray[np.int64]
+    """(N, F) obj_id of the best class of each true object's box, -1 without a box"""
     class_probability: Array
-    """(N, F) the box's score of the true class, background left out; 0 without a box"""
+    """(N, F) the box's score of the true class; 0 without a box"""
+    class_square: Array
+    """(N, F) squared distance of its scores, background taken for "nothing there", from the truth (Brier)"""
     false_boxes: int
     """boxes that belong to no visible true object"""
+
+
+class Belief(NamedTuple):
+    """What a method believes of one true object in each frame (F)."""
+
+    probability: Array
+    """(F,) P(exists) P(true class); 0 where either is missing"""
+    square: Array
+    """(F,) squared distance of P(exists) P(class) and P(not there) from 1 for the truth and 0 for the rest (Brier)"""
 
 
 def class_correct(truth: ObjectFrames, estimate: ObjectFrames, matching: Matching) -> Bools:
@@ -63,22 +70,43 @@ def class_probability(method: MethodMap, row: int, class_id: NDArray[np.int64]) 
     return out
 
 
-def score_detections(run: Run, truth: ObjectFrames) -> DetectorScore:
+def belief(method: MethodMap, row: int, class_id: NDArray[np.int64]) -> Belief:
+    """What a method's object `row`, -1 for none, says of a true object of classes (F,)."""
+    probability = class_probability(method, row, class_id)
+    squares = np.ones(len(class_id))
+    if row >= 0:
+        exists = method.estimate.existence[row, method.held]
+        each = exists[:, None] * method.estimate.class_probability[row, method.held]
+        squares = (each**2).sum(axis=-1) + (1.0 - exists) ** 2
+    return Belief(probability, squares - 2.0 * probability + 1.0)
+
+
+def score_detections(run: Run, truth: ObjectFrames, boxes: TrueBoxes) -> DetectorScore:
     """Match the run's recorded detections to the boxes of the visible true objects, frame by frame."""
-    correct = np.zeros(truth.visible.shape, dtype=np.bool_)
-    probability = np.zeros(truth.visible.shape)
+    class_id = np.full(truth.visible.shape, -1, dtype=np.int64)
+    probability, square = np.zeros(truth.visible.shape), np.full(truth.visible.shape, 2.0)
     false_boxes = 0
     obj_ids = np.array(run.catalogue.obj_ids)
     for f, frame in enumerate(run.frames):
-        rows, boxes = _true_boxes(run.catalogue, truth, f, frame.camera)
-        pairs = match_boxes(boxes, _boxes(frame.detections))
+        rows, true = boxes.counting(f)
+        pairs = match_boxes(true, np.array([d.box for d in frame.detections], dtype=np.float64).reshape(-1, 4))
         false_boxes += len(frame.detections) - len(pairs)
         for b, d in pairs:
-            n, scores = rows[b], frame.detections[d].class_scores[1:]
-            true_class = truth.class_id[n, f]
-            correct[n, f] = obj_ids[np.argmax(scores)] == true_class
-            probability[n, f] = scores[run.catalogue.index(int(true_class))] / max(scores.sum(), 1e-12)
-    return DetectorScore(correct, probability, false_boxes)
+            n, scores = rows[b], frame.detections[d].class_scores
+            class_id[n, f] = obj_ids[np.argmax(scores[1:])]
+            probability[n, f] = scores[1 + run.catalogue.index(int(truth.class_id[n, f]))]
+            square[n, f] = (scores**2).sum() - 2.0 * probability[n, f] + 1.0
+    return DetectorScore(class_id, probability, square, false_boxes)
+
+
+def best_classes(run: Run) -> list[list[tuple[int, float, Box]]]:
+    """For each frame obj_id, score and box of each detection: its best class, and that class's score."""
+    out = []
+    for frame in run.frames:
+        best = [int(np.argmax(d.class_scores[1:])) for d in frame.detections]
+        found = zip(best, frame.detections, strict=True)
+        out.append([(run.catalogue.obj_ids[c], float(d.class_scores[1 + c]), d.box) for c, d in found])
+    return out
 
 
 def match_boxes(ours: Array, theirs: Array) -> list[tuple[int, int]]:
@@ -96,15 +124,3 @@ def iou(ours: Array, theirs: Array) -> Array:
     shared = np.clip(high - low, 0.0, None).prod(axis=-1)
     union = ours[:, None, 2:].prod(axis=-1) + theirs[None, :, 2:].prod(axis=-1) - shared
     return shared / np.where(union > 0, union, 1.0)
-
-
-def _true_boxes(catalogue: Catalogue, truth: ObjectFrames, f: int, camera: Camera) -> tuple[NDArray[np.int64], Array]:
-    """Rows of the true objects that count in frame f, and the boxes (n, 4) of their visible pixels."""
-    present = np.flatnonzero(truth.present[:, f])
-    drawn = silhouettes(catalogue, truth.class_id[present, f], truth.T_camera_object[present, f], camera)
-    boxes = [(n, s.visible_box) for n, s in zip(present, drawn, strict=True) if truth.visible[n, f] and s.visible_box]
-    return np.array([n for n, _ in boxes], dtype=np.int64), np.array([b for _, b in boxes]).reshape(-1, 4)
-
-
-def _boxes(detections: tuple[Detection, ...]) -> Array:
-    return np.array([d.box for d in detections], dtype=np.float64).reshape(-1, 4)

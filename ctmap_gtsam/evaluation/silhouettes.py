@@ -14,7 +14,9 @@ from sequences.catalogue import Catalogue, Mesh
 from sequences.rendering.scene import render_scene
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
+Window = tuple[slice, slice]
 
 
 class Silhouette(NamedTuple):
@@ -24,8 +26,10 @@ class Silhouette(NamedTuple):
     """pixels of the image that it covers were it alone; 0 where it is out of view"""
     visible_pixels: int
     """pixels of those where no other object of the map is nearer"""
+    box: Box | None
+    """x, y, width, height of the enclosing box of all of its pixels (COCO); None where there are none"""
     visible_box: Box | None
-    """x, y, width, height of the enclosing box of the visible pixels (COCO); None where there are none"""
+    """the same of the visible ones"""
 
     @property
     def visible_fraction(self) -> float:
@@ -34,17 +38,25 @@ class Silhouette(NamedTuple):
 
 
 def silhouettes(
-    catalogue: Catalogue, class_id: Sequence[int] | NDArray[np.int64], T_camera_object: Array, camera: Camera
+    catalogue: Catalogue,
+    class_id: Sequence[int] | NDArray[np.int64],
+    T_camera_object: Array,
+    camera: Camera,
+    step: int = 1,
 ) -> list[Silhouette]:
-    """Draw n objects of a map, obj_ids (n,) at poses (n, 4, 4), into one camera. Only they hide each other."""
-    drawn = [_draw(catalogue[int(c)].mesh, T, camera) for c, T in zip(class_id, T_camera_object, strict=True)]
-    nearest = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    """Draw n objects of a map, obj_ids (n,) at poses (n, 4, 4), into one camera. Only they hide each other.
+
+    With a step, every `step`-th pixel each way stands for its neighbours: boxes are then good to `step` pixels.
+    """
+    coarse = camera.window(0, 0, -(-camera.width // step), -(-camera.height // step), step)
+    drawn = [_draw(catalogue[int(c)].mesh, T, coarse) for c, T in zip(class_id, T_camera_object, strict=True)]
+    nearest = np.full((coarse.height, coarse.width), np.inf, dtype=np.float32)
     for window, depth in drawn:
         np.minimum(nearest[window], depth, out=nearest[window])
-    return [_silhouette(window, depth, nearest) for window, depth in drawn]
+    return [_silhouette(window, depth, nearest, camera, step) for window, depth in drawn]
 
 
-def _draw(mesh: Mesh, T: Array, camera: Camera) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
+def _draw(mesh: Mesh, T: Array, camera: Camera) -> tuple[Window, NDArray[np.float32]]:
     """The window (rows, columns) that the mesh may cover, and its depth there, infinite where nothing is."""
     x, y, width, height = _window(mesh, T, camera)
     rows, columns = slice(y, y + height), slice(x, x + width)
@@ -67,12 +79,28 @@ def _window(mesh: Mesh, T: Array, camera: Camera) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def _silhouette(window: tuple[slice, slice], depth: NDArray[np.float32], nearest: NDArray[np.float32]) -> Silhouette:
+def _silhouette(
+    window: Window, depth: NDArray[np.float32], nearest: NDArray[np.float32], camera: Camera, step: int
+) -> Silhouette:
     covered = np.isfinite(depth)
     visible = covered & (depth <= nearest[window])
-    if not visible.any():
-        return Silhouette(int(covered.sum()), 0, None)
-    rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
-    x, y = window[1].start + columns[0], window[0].start + rows[0]
-    box = (float(x), float(y), float(columns[-1] - columns[0] + 1), float(rows[-1] - rows[0] + 1))
-    return Silhouette(int(covered.sum()), int(visible.sum()), box)
+    return Silhouette(
+        int(covered.sum()) * step**2,
+        int(visible.sum()) * step**2,
+        _box(covered, window, camera, step),
+        _box(visible, window, camera, step),
+    )
+
+
+def _box(covered: Bools, window: Window, camera: Camera, step: int) -> Box | None:
+    """What encloses the pixels, each with its share of the way to the next one, in the whole image."""
+    rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
+    if len(rows) == 0:
+        return None
+    half = 0.5 * (step - 1)
+    left, right = (step * (window[1].start + columns[k]) for k in (0, -1))
+    top, bottom = (step * (window[0].start + rows[k]) for k in (0, -1))
+    x, y = max(left - half, 0.0), max(top - half, 0.0)
+    width = min(right + half + 1.0, float(camera.width)) - x
+    height = min(bottom + half + 1.0, float(camera.height)) - y
+    return (float(x), float(y), float(width), float(height))

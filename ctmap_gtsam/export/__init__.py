@@ -2,6 +2,5 @@
 
 from ctmap_gtsam.export.bop import bop_csv
 from ctmap_gtsam.export.coco import coco_detections, coco_results
-from ctmap_gtsam.export.views import FrameView, views
 
-__all__ = ["FrameView", "bop_csv", "coco_detections", "coco_results", "views"]
+__all__ = ["bop_csv", "coco_detections", "coco_results"]

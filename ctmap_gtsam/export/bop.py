@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ctmap_gtsam.export.views import FrameView
+from ctmap_gtsam.evaluation.views import FrameView
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 
@@ -13,7 +13,7 @@ def bop_csv(views: Iterable[FrameView], seconds_per_image: float | None = None) 
     """The whole file as text.
 
     Args:
-        views: from `ctmap_gtsam.export.views.views`.
+        views: from `ctmap_gtsam.evaluation.views.views`.
         seconds_per_image: written as `time`, the same for all images; -1 where nobody knows.
 
     Returns:

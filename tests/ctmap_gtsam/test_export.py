@@ -6,7 +6,8 @@ import io
 import numpy as np
 import pytest
 
-from ctmap_gtsam.export import bop_csv, coco_detections, coco_results, views
+from ctmap_gtsam.evaluation.views import views
+from ctmap_gtsam.export import bop_csv, coco_detections, coco_results
 from sequences import se3
 from sequences.bop import load_run, load_truth
 from tests.ctmap_gtsam import synthetic
