@@ -9,6 +9,7 @@ from sequences.errors import InputError
 from sequences.simulation import MotionConfig, PlaceConfig
 from sequences.simulation.motion import arrange
 from sequences.simulation.place import Place, Placed, footprint, furnish, separation
+from sequences.simulation.shapes import household
 from tests.sequences.simulation.solid_geometry import winding_numbers
 
 CONFIG = PlaceConfig(objects=12)
@@ -88,10 +89,10 @@ def test_few_things_are_of_several_categories_and_distractors_are_not_in_the_pla
 
 
 def test_classes_repeat_when_all_are_used():
-    place = furnish(PlaceConfig(objects=15), 0)
-    things = arrange(place, PlaceConfig(objects=15), MotionConfig(visits=1), 0)[0].things
-    assert len({t.inst_id for t in things}) == 15
-    assert len({t.shape.object_class.obj_id for t in things}) == 12
+    known = sum(s.object_class.movable for s in household())
+    stock = furnish(PlaceConfig(objects=known + 3), 0).stock
+    assert len(stock) == known + 3
+    assert len({s.object_class.obj_id for s in stock}) == known
 
 
 @pytest.mark.parametrize("moves", [0, 1, 3])
