@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,17 @@ from sequences.types import Frame, MoveKind, Run, TrueMove, TrueObject, Truth, V
 Array = NDArray[np.float64]
 
 
+_UNKNOWN_BOX = np.full(4, np.nan)
+
+
+class _Visibility(NamedTuple):
+    """One entry of scene_gt_info.json."""
+
+    fraction: float
+    box: Array
+    """(4,)"""
+
+
 @dataclass(frozen=True)
 class _Sighting:
     """One entry of scene_gt.json."""
@@ -32,7 +43,7 @@ class _Sighting:
     obj_id: int
     frame: int
     T_world_object: Array
-    visible_fraction: float
+    visible: _Visibility
     support: int
     """inst_id, -1 where the file names none"""
     node: Node
@@ -44,7 +55,7 @@ def load_truth(run: Run) -> Truth | None:
     - `inst_id` says which physical object an entry is, over all visits. In a visit without inst_id the k-th entry of an
       obj_id is taken to be one object in all frames of that visit, and another in each other visit.
     - scene_camera_gt.json holds the true camera poses in the visit's frame; without it the recorded ones count.
-    - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing.
+    - visible_fraction is scene_gt_info.json's visib_fract, 1 where it is missing; visible_box its bbox_visib.
     - Moves are those of scene_gt_moves.json. What they say of visits that the run doesn't have is left out.
 
     Raises:
@@ -99,7 +110,7 @@ def _sightings(
     folder: Path, v: int, visit: Visit, obj_ids: Collection[int], cameras: Array, checks: Checks
 ) -> list[_Sighting]:
     entries = layout.image_entries(Node.read(folder / layout.SCENE_GT, ""))
-    visible = _visible_fractions(folder)
+    visible = _visibility(folder)
     found: list[_Sighting] = []
     given: set[bool] = set()
     for frame in visit.frames:
@@ -127,7 +138,7 @@ def _sighting(
     obj_ids: Collection[int],
     cameras: Array,
     key: Callable[[Node, int], tuple[int, ...]],
-    visible: float,
+    visible: _Visibility,
 ) -> _Sighting:
     obj_id = node["obj_id"].integer()
     if obj_id not in obj_ids:
@@ -154,13 +165,13 @@ def _counted(v: int) -> Callable[[Node, int], tuple[int, ...]]:
     return key
 
 
-def _visible_fractions(folder: Path) -> Callable[[int, int], float]:
+def _visibility(folder: Path) -> Callable[[int, int], _Visibility]:
     file = folder / layout.SCENE_GT_INFO
     if not file.is_file():
-        return lambda im_id, k: 1.0
+        return lambda im_id, k: _Visibility(1.0, _UNKNOWN_BOX)
     entries = layout.image_entries(Node.read(file, ""))
 
-    def fraction(im_id: int, k: int) -> float:
+    def visibility(im_id: int, k: int) -> _Visibility:
         elements = entries[im_id].elements() if im_id in entries else []
         if k >= len(elements):
             raise InputError(
@@ -169,9 +180,11 @@ def _visible_fractions(folder: Path) -> Callable[[int, int], float]:
                 field=str(im_id),
                 remedy=f"write one entry for each of {layout.SCENE_GT}, or remove the file",
             )
-        return elements[k]["visib_fract"].number()
+        box = elements[k].get("bbox_visib")
+        known = _UNKNOWN_BOX if box is None else box.numbers(4)
+        return _Visibility(elements[k]["visib_fract"].number(), known if (known[2:] > 0).all() else _UNKNOWN_BOX)
 
-    return fraction
+    return visibility
 
 
 def _on_known_supports(sightings: list[_Sighting], checks: Checks) -> list[_Sighting]:
@@ -217,7 +230,8 @@ def _object(inst_id: int, sightings: list[_Sighting]) -> TrueObject:
         obj_id=obj_ids[0],
         frames=np.array([s.frame for s in sightings], dtype=np.int64),
         T_world_object=np.stack([s.T_world_object for s in sightings]),
-        visible_fraction=np.array([s.visible_fraction for s in sightings]),
+        visible_fraction=np.array([s.visible.fraction for s in sightings]),
+        visible_box=np.stack([s.visible.box for s in sightings]),
         support=np.array([s.support for s in sightings], dtype=np.int64),
     )
 

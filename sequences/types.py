@@ -116,6 +116,8 @@ class TrueObject:
     """(n, 4, 4) at those frames, with the true camera pose"""
     visible_fraction: Array
     """(n,) visible share of the silhouette, 1 where scene_gt_info.json is missing"""
+    visible_box: Array
+    """(n, 4) x, y, width, height of the visible pixels; NaN where there are none, or nobody says"""
     support: NDArray[np.int64]
     """(n,) inst_id of the object that it stands on; -1 where that isn't known, or is none of the truth's objects"""
 

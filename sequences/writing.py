@@ -42,6 +42,8 @@ class Sighting:
     """visible share of the silhouette"""
     support: int | None = None
     """inst_id of the object that it stands on; None where that isn't known, or is none of the truth's objects"""
+    visible_box: tuple[float, float, float, float] | None = None
+    """x, y, width, height of the visible pixels, pixels; zeros where there are none, None where that isn't known"""
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,7 @@ class VisitWriter:
         if truth is not None:
             self._truth_cameras[key] = self._pose_json(truth.T_world_camera)
             self._truth[key] = [_sighting_json(s, truth.T_world_camera) for s in truth.sightings]
-            self._truth_info[key] = [{"visib_fract": float(s.visible_fraction)} for s in truth.sightings]
+            self._truth_info[key] = [_visibility_json(s) for s in truth.sightings]
 
     def add_move(
         self,
@@ -322,6 +324,14 @@ def _detection_json(detection: Detection, scene_id: int, im_id: int, catalogue: 
         "score": float(detection.class_scores[1 + best]),
         "class_scores": detection.class_scores.tolist(),
     }
+
+
+def _visibility_json(sighting: Sighting) -> Json:
+    out: Json = {"visib_fract": float(sighting.visible_fraction)}
+    box = sighting.visible_box
+    if box is not None:
+        out["bbox_visib"] = [float(value) for value in box] if box[2] > 0 else [-1, -1, -1, -1]  # as BOP has it
+    return out
 
 
 def _sighting_json(sighting: Sighting, T_world_camera: Array) -> Json:

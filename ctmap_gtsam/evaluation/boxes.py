@@ -4,9 +4,9 @@ Boxes are matched to true boxes by faster-coco-eval, COCO's rules: within an ima
 to the free true box that it overlaps most. What is kept of that is enough to pool images of many runs again and again
 and get the same precision at 101 recalls (Lin et al., Microsoft COCO, ECCV 2014) as faster-coco-eval gets.
 
-A true box encloses the visible pixels of an object. Objects of which less than VISIBLE_FRACTION is visible are ignored,
-as in BOP: the box of all their pixels in the image is an ignore region (COCO's iscrowd), and estimates of their class
-that lie in it by half or more count neither for nor against.
+A true box encloses the visible pixels of an object (BOP's bbox_visib). Objects of which less than VISIBLE_FRACTION is
+visible are ignored, as in BOP: the box of all their pixels in the image is an ignore region (COCO's iscrowd), and
+estimates of their class that lie in it by half or more count neither for nor against.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.evaluation.matching import ObjectFrames
 from ctmap_gtsam.evaluation.silhouettes import Box, silhouettes
-from sequences.types import Run
+from sequences.catalogue import Catalogue
+from sequences.types import Frame, Run, Truth
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -70,27 +71,46 @@ class JudgedBoxes:
     """(C,) true boxes of each class that count"""
 
 
-def true_boxes(run: Run, truth: ObjectFrames, step: int = 1) -> TrueBoxes:
-    """The boxes of a run's true objects, drawn from every `step`-th pixel each way; only they hide each other."""
-    rows: list[tuple[int, int, int, Box, bool]] = []
-    for frame in run.frames:
-        f = frame.index
-        present = np.flatnonzero(truth.present[:, f])
-        drawn = silhouettes(
-            run.catalogue, truth.class_id[present, f], truth.T_camera_object[present, f], frame.camera, step
-        )
-        for n, seen in zip(present, drawn, strict=True):
-            counts = bool(truth.visible[n, f])
-            box = seen.visible_box if counts else seen.box
-            if box is not None:
-                rows.append((f, int(n), int(truth.class_id[n, f]), box, not counts))
+def true_boxes(run: Run, truth: Truth, objects: ObjectFrames, step: int = 1) -> TrueBoxes:
+    """The boxes of a run's true objects: the truth's own where it has them, else drawn.
+
+    Args:
+        run: the recording.
+        truth: about it.
+        objects: the same in the true cameras, see `matching.from_truth`.
+        step: only every `step`-th pixel each way is drawn. What is drawn is hidden by other true objects alone.
+    """
+    known = np.full((*objects.class_id.shape, 4), np.nan)
+    for n, thing in enumerate(truth.objects):
+        known[n, thing.frames] = thing.visible_box
+    rows = [
+        row for frame in run.frames for row in _boxes_in(run.catalogue, frame, objects, known[:, frame.index], step)
+    ]
     return TrueBoxes(
         frame=np.array([r[0] for r in rows], dtype=np.int64),
         object=np.array([r[1] for r in rows], dtype=np.int64),
-        class_id=np.array([r[2] for r in rows], dtype=np.int64),
-        box=np.array([r[3] for r in rows], dtype=np.float64).reshape(-1, 4),
-        ignore=np.array([r[4] for r in rows], dtype=np.bool_),
+        class_id=np.array([objects.class_id[r[1], r[0]] for r in rows], dtype=np.int64),
+        box=np.array([r[2] for r in rows], dtype=np.float64).reshape(-1, 4),
+        ignore=np.array([not objects.visible[r[1], r[0]] for r in rows], dtype=np.bool_),
     )
+
+
+def _boxes_in(
+    catalogue: Catalogue, frame: Frame, objects: ObjectFrames, known: Array, step: int
+) -> list[tuple[int, int, Box]]:
+    """Frame, row and box of each true object that shows in a frame; `known` (N, 4), NaN where it has to be drawn."""
+    f = frame.index
+    counts, present = objects.visible[:, f], objects.present[:, f]
+    given = counts & np.isfinite(known[:, 0])
+    drawn: dict[int, Box | None] = {}
+    # what doesn't count is drawn alone; what counts has to be drawn with all that may hide it
+    rows = np.flatnonzero(present if (counts & ~given).any() else present & ~given)
+    if len(rows):
+        poses = objects.T_camera_object[rows, f]
+        seen = silhouettes(catalogue, objects.class_id[rows, f], poses, frame.camera, step)
+        drawn = {int(n): s.visible_box if counts[n] else s.box for n, s in zip(rows, seen, strict=True)}
+    boxes = {int(n): tuple(known[n].tolist()) if given[n] else drawn[int(n)] for n in np.flatnonzero(present)}
+    return [(f, n, box) for n, box in boxes.items() if box is not None]
 
 
 def judge_boxes(

@@ -130,7 +130,7 @@ class Judge:
     @cached_property
     def boxes(self) -> TrueBoxes:
         """The true objects' boxes."""
-        return true_boxes(self.run, self.objects, self._step)
+        return true_boxes(self.run, self.truth, self.objects, self._step)
 
     def estimate(self, method: MethodMap) -> Judgement:
         """Judge a method that has poses."""

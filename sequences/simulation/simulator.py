@@ -83,7 +83,7 @@ def _simulate_visit(
         depth = sensor.measure(surfaces.view(images, camera, T), rng)
         colour = photograph(scene, camera, T, config.sensor.antialias)
         sightings = [
-            Sighting(p.inst_id, p.shape.object_class.obj_id, p.T_world_object, v.fraction)
+            Sighting(p.inst_id, p.shape.object_class.obj_id, p.T_world_object, v.fraction, visible_box=v.box)
             for p, v in zip(placed, visible, strict=True)
         ]
         writer.add_frame(

@@ -150,6 +150,18 @@ def test_visible_fractions_must_match_the_entries(tiny_run):
     assert caught.value.field == "3"
 
 
+def test_boxes_of_visible_pixels_are_known_where_the_file_has_them(tiny_run):
+    def boxed(entries):
+        entries["2"][0]["bbox_visib"] = [3, 4, 10, 8]
+        entries["3"][0]["bbox_visib"] = [-1, -1, -1, -1]
+
+    edit(tiny_run / SCENE / "scene_gt_info.json", boxed)
+    box, can = load_truth(load_run(tiny_run)).objects
+    assert box.visible_box[1].tolist() == [3, 4, 10, 8]
+    assert np.isnan(np.delete(box.visible_box, 1, axis=0)).all()
+    assert np.isnan(can.visible_box).all()
+
+
 def test_what_things_stand_on_is_known_frame_by_frame(tiny_run):
     def lifted(entries):
         del entries["2"][0]["support"]
