@@ -11,14 +11,11 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import factors
-import sequences
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation.comparison import Comparison, compare
@@ -28,6 +25,7 @@ from ctmap_gtsam.evaluation.views import views
 from ctmap_gtsam.export import bop_csv, coco_detections, coco_results
 from ctmap_gtsam.reporting.report import render
 from ctmap_gtsam.runtime.settings import to_dict
+from ctmap_gtsam.runtime.sources import code
 from ctmap_gtsam.runtime.versions import versions
 from sequences.atomic import write_json, write_text
 from sequences.bop import load_run
@@ -40,8 +38,6 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 SUMMARY, REPORT, ESTIMATES = "summary.json", "report.html", "estimates"
-
-_NOT_ESTIMATING = {"bench", "cli", "comparing.py", "evaluation", "export", "reporting"}
 
 
 def compare_run(
@@ -204,7 +200,7 @@ def _run_method(run: Run, method: Method, config: Config, store: Path | None, pr
         return Outcome("skipped", reason=obstacle)
     if method.kind == "detections":
         return Outcome("ok", 0.0)
-    key = {"method": method.name, "config": to_dict(config), "fingerprint": run.fingerprint, "code": _code()}
+    key = {"method": method.name, "config": to_dict(config), "fingerprint": run.fingerprint, "code": code().estimating}
     stored = _Stored(store, method.name, json.loads(json.dumps(key))) if store is not None else None
     if stored is not None and (found := stored.load()) is not None:
         return found
@@ -215,18 +211,6 @@ def _run_method(run: Run, method: Method, config: Config, store: Path | None, pr
     if stored is not None:
         stored.save(estimate, seconds)
     return Outcome("ok", seconds, estimate)
-
-
-@cache
-def _code() -> str:
-    """SHA-256 over the source that estimates: an estimate of other code is another estimate."""
-    digest = hashlib.sha256()
-    for root in (Path(__file__).parent, Path(factors.__path__[0]), Path(sequences.__path__[0])):
-        for path in sorted(root.rglob("*.py")):
-            relative = path.relative_to(root)
-            if root.name != "ctmap_gtsam" or relative.parts[0] not in _NOT_ESTIMATING:
-                digest.update(f"{root.name}/{relative.as_posix()}\0".encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 def _estimates(outcomes: Mapping[str, Outcome]) -> dict[str, Estimate]:

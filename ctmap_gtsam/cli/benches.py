@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from ctmap_gtsam.cli.options import Assignments, ConfigFile, JsonFile, Seed, settings
+from ctmap_gtsam.cli.options import Assignments, ConfigFile, JsonFile, Out, Seed, settings, writable
+
+EXIT_FAILED = 1
 
 bench_app = typer.Typer(no_args_is_help=True, help="Measure speed, and what the estimators reach.")
 
@@ -20,6 +23,71 @@ def render(
     Example: `ctmap bench render --json render.json`
     """
     _figures("render", json_file, config_file, assignments, seed)
+
+
+@bench_app.command()
+def paper(
+    out: Out,
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="SET", help="Places: tuning, reported, or seeds such as 0-4,7.")
+    ] = "reported",
+    quick: Annotated[bool, typer.Option("--quick", help="Short for the first three of the tuning seeds.")] = False,
+    passes: Annotated[
+        str,
+        typer.Option(
+            "--pass", metavar="A,B,...", help="main, wrong-x4, wrong-/4, shuffled, an ablation, passes, ablations."
+        ),
+    ] = "main",
+    methods: Annotated[
+        str | None, typer.Option("--methods", metavar="A,B,...", help="Only these methods.", show_default="all")
+    ] = None,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Run each method with so many seeds.")] = 1,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes.", show_default="one a core")
+    ] = None,
+    keep_runs: Annotated[bool, typer.Option("--keep-runs", help="Keep the simulated runs, some 60 MB each.")] = False,
+    freeze: Annotated[
+        bool, typer.Option("--freeze", help="Only simulate the reported places and write their hashes: a new set.")
+    ] = False,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """The paper's Table I and pose accuracy on simulated places (synthetic), beside the paper's figures.
+
+    Writes DIR/paper.json, DIR/paper.md and plots. What is in DIR already, of the same settings and code, is not done
+    again, so it may be stopped at any time; the passes add to what is there. The settings are the benchmark's own,
+    unless --config gives others.
+
+    Example: `ctmap bench paper --quick --out paper-quick`
+    """
+    from ctmap_gtsam.bench import paper as bench
+    from ctmap_gtsam.runtime.progress import RichProgress
+    from sequences.atomic import write_json
+
+    config = settings(config_file or bench.SETTINGS, assignments, seed)
+    protocol = bench.load_protocol()
+    task = bench.Task(
+        seeds=protocol.seeds("quick" if quick else seeds),
+        passes=protocol.choose(passes),
+        methods=None if methods is None else tuple(name.strip() for name in methods.split(",")),
+        repeats=repeats,
+    )
+    with RichProgress() as progress:
+        workshop = bench.Workshop(
+            workers=workers, keep_runs=keep_runs, progress=progress, say=lambda line: typer.echo(line, err=True)
+        )
+        if freeze:
+            failures = bench.freeze(writable(out), config, protocol, workshop)
+        else:
+            outcome = bench.run_paper(writable(out), config, task, workshop)
+            failures = outcome.failures
+            typer.echo(outcome.tables)
+            if json_file is not None:
+                write_json(json_file, outcome.result)
+    if failures:
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _figures(

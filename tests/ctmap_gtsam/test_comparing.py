@@ -14,6 +14,7 @@ import pytest
 from ctmap_gtsam.comparing import compare_run, report, run_methods
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.runtime.sources import code
 from sequences.bop import load_run, load_truth
 from sequences.errors import InputError
 from tests.ctmap_gtsam import synthetic
@@ -127,7 +128,7 @@ def test_what_differs_is_made_again(path, tmp_path, registry, ran, monkeypatch, 
     elif change == "missing":
         about.unlink()
     elif change == "code":
-        monkeypatch.setattr("ctmap_gtsam.comparing._code", lambda: "other")
+        monkeypatch.setattr("ctmap_gtsam.comparing.code", lambda: replace(code(), estimating="other"))
     outcome = run_methods(run, ["smooth-ct"], config, tmp_path, registry=registry)["smooth-ct"]
     assert ran == ["smooth-ct"] * 2
     if change != "seed":
