@@ -104,6 +104,10 @@ class Run:
         return tuple(frame for visit in self.visits for frame in visit.frames)
 
 
+VISIBLE_FRACTION = 0.1
+"""A true object counts in a frame where at least this share of its silhouette is visible (BOP's threshold)"""
+
+
 @dataclass(frozen=True)
 class TrueObject:
     """One physical object over a run: what scene_gt.json says. Only evaluation and simulation read it."""

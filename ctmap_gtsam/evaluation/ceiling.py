@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate, Ledger, Modes, Moves
-from ctmap_gtsam.evaluation.matching import VISIBLE_FRACTION
-from sequences.types import Run, TrueObject, Truth
+from sequences.types import VISIBLE_FRACTION, Run, TrueObject, Truth
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

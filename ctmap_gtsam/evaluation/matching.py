@@ -24,13 +24,10 @@ from ctmap_gtsam.estimate import Estimate, Snapshot
 from ctmap_gtsam.evaluation.pose import Shape
 from sequences import se3
 from sequences.catalogue import Catalogue
-from sequences.types import Frame, Run, Truth
+from sequences.types import VISIBLE_FRACTION, Frame, Run, Truth
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-VISIBLE_FRACTION = 0.1
-"""A true object counts in a frame where at least this share of its silhouette is visible (BOP's threshold)"""
 
 REACH_M = 0.05
 """Centres further apart than this, or than half the smaller object's diameter where that is more, don't match. The
@@ -68,6 +65,8 @@ class MethodMap(NamedTuple):
     objects: ObjectFrames
     held: Ints
     """(F,) the keyframe whose map each frame shows"""
+    T_world_camera: Array
+    """(F, 4, 4) the method's own cameras"""
 
 
 class Matching(NamedTuple):
@@ -106,13 +105,14 @@ def from_estimate(run: Run, name: str, estimate: Estimate) -> MethodMap:
     shape = (len(estimate.object_id), len(run.frames))
     class_id, visible = np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=np.bool_)
     poses, held = np.full((*shape, 4, 4), np.nan), np.zeros(shape[1], dtype=np.int64)
+    cameras = np.zeros((shape[1], 4, 4))
     for f, snapshot in enumerate(snapshots(run.frames, estimate)):
         rows = snapshot.objects
-        held[f] = snapshot.keyframe
+        held[f], cameras[f] = snapshot.keyframe, snapshot.T_world_camera
         class_id[rows, f] = snapshot.class_id
         poses[rows, f] = se3.inverse(snapshot.T_world_camera) @ snapshot.T_world_object
         visible[rows, f] = estimate.in_view[rows, snapshot.keyframe]
-    return MethodMap(name, estimate, ObjectFrames(estimate.object_id, class_id, poses, visible), held)
+    return MethodMap(name, estimate, ObjectFrames(estimate.object_id, class_id, poses, visible), held, cameras)
 
 
 def centres(objects: ObjectFrames, shapes: dict[int, Shape]) -> Array:
@@ -147,7 +147,7 @@ def match(reference: ObjectFrames, candidates: ObjectFrames, shapes: dict[int, S
 def _closeness(reference: ObjectFrames, candidates: ObjectFrames, shapes: dict[int, Shape]) -> Array:
     """(N, M) sum over frames of 1 - min(distance / reach, 1): least cost, seen from the other side."""
     weight = np.where(reference.visible, 1.0, HIDDEN_WEIGHT)
-    reach, their_reach = _reach(reference, shapes), _reach(candidates, shapes)
+    reach, their_reach = reach_of(reference, shapes), reach_of(candidates, shapes)
     ours, theirs = centres(reference, shapes), centres(candidates, shapes)
     out = np.zeros((len(reference.name), len(candidates.name)))
     for n in range(len(out)):
@@ -157,8 +157,8 @@ def _closeness(reference: ObjectFrames, candidates: ObjectFrames, shapes: dict[i
     return out
 
 
-def _reach(objects: ObjectFrames, shapes: dict[int, Shape]) -> Array:
-    """(N, F) of each object by its own size, metres."""
+def reach_of(objects: ObjectFrames, shapes: dict[int, Shape]) -> Array:
+    """(N, F) how near something has to be to be each object, by its own size, metres."""
     out = np.full(objects.class_id.shape, REACH_M)
     for obj_id in np.unique(objects.class_id[objects.present]):
         out[objects.class_id == obj_id] = max(REACH_M, 0.5 * shapes[int(obj_id)].of.diameter_m)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate, Snapshot
-from ctmap_gtsam.evaluation.matching import VISIBLE_FRACTION, snapshots
+from ctmap_gtsam.evaluation.matching import snapshots
 from ctmap_gtsam.evaluation.silhouettes import Box, Silhouette, silhouettes
 from sequences import se3
-from sequences.types import Frame, Run
+from sequences.types import VISIBLE_FRACTION, Frame, Run
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
