@@ -1,6 +1,6 @@
 """The paper's benchmark on simulated places: Table I, pose accuracy, what hindsight adds, what each assumption buys.
 
-All of it is synthetic. `protocol` says what is done, `places` and `units` do it, `pool` and `agenda` in which order,
+All of it is synthetic. `protocol` says what is done, `places` and `units` do it, `agenda` says in which order,
 `results` makes figures of it, `tables` and `plots` show them.
 """
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ctmap_gtsam.bench.paper.pool import Job
 from ctmap_gtsam.bench.paper.protocol import Place
 from ctmap_gtsam.bench.paper.units import Store, Unit
+from ctmap_gtsam.runtime.pool import Job
 
 if TYPE_CHECKING:
     from ctmap_gtsam.methods import Method

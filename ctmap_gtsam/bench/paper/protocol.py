@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctmap_gtsam.config import Config
+from ctmap_gtsam.evaluation import ceiling
 from ctmap_gtsam.runtime.settings import merge, parse_assignments, to_dict
 from sequences.errors import InputError
 from sequences.seeds import generator
@@ -20,8 +21,11 @@ from sequences.simulation import SimulationConfig
 PROTOCOL = Path(__file__).with_name("protocol.toml")
 SETTINGS = Path(__file__).with_name("settings.toml")
 
-MAIN, CEILING = "main", "truth"
-"""Name of the pass in which nothing is changed; of the row in which the truth's own map is scored"""
+MAIN = "main"
+"""Name of the pass in which nothing is changed"""
+
+CEILING = ceiling.NAME
+"""Name of the row in which the truth's own map is scored"""
 
 SETS = ("tuning", "reported")
 

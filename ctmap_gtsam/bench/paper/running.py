@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from ctmap_gtsam.bench.paper import places as frozen
 from ctmap_gtsam.bench.paper.agenda import Agenda, Failure, Say
 from ctmap_gtsam.bench.paper.places import Identity
-from ctmap_gtsam.bench.paper.pool import work_off
 from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN, Place, Protocol, Variant, load_protocol
 from ctmap_gtsam.bench.paper.results import Key, Results, differences_json, rows_json
 from ctmap_gtsam.bench.paper.units import Store, Unit
 from ctmap_gtsam.config import Config
+from ctmap_gtsam.runtime.pool import work_off
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.versions import versions
 from sequences.atomic import write_json, write_text
