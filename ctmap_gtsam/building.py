@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 POTENTIALS = ("depth", "detection", "class", "prediction", "persistence", "context", "support")
 
 
+_NO_SUPPORT = -(1 << 31)  # of Estimate.moves: not known
+
+
 @dataclass
 class Tables:
     """What an estimator writes down while it works. Objects and keyframes are named by their rows."""
@@ -47,6 +50,10 @@ class Tables:
         axes = np.zeros((6, 3))
         axes[:, : free.shape[1]] = free
         self.modes.append((row, keyframe, class_id, log_weight, T, covariance, axes))
+
+    def move(self, row: int, gap: tuple[int, int], probability: float, times_ns: tuple[int, int]) -> None:
+        """Add P(moved) for the gap between two keyframes, with the times between which it would have been."""
+        self.moves.append((row, gap, probability, times_ns, _NO_SUPPORT, _NO_SUPPORT))
 
     def note(self, row: int, keyframe: int, potential: str, nats: float, other: int = -1) -> None:
         """Add a line of the ledger."""

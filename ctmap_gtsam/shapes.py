@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from trimesh.poses import compute_stable_poses
 
 from factors.symmetry import Symmetry
 from sequences import se3
@@ -21,6 +23,8 @@ from sequences.distance import DistanceField, distance_field
 from sequences.meshes import simplify
 
 Array = NDArray[np.float64]
+
+_ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,31 @@ class Shape:
     def hull_points(self) -> Array:
         """(H, 3) vertices of the convex hull, centre frame: what can touch a plane."""
         return self.mesh.vertices[ConvexHull(self.mesh.vertices).vertices]
+
+    @cached_property
+    def _stable(self) -> tuple[Array, Array]:
+        """Stable rests by convex hull and centre of mass, and how likely each is (Goldberg et al., 1999; trimesh)."""
+        hull = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False).convex_hull
+        T, probability = compute_stable_poses(hull, sigma=0.0, n_samples=1, threshold=0.01)
+        return T[:, :3, :3], np.sqrt(probability) / np.sqrt(probability).sum()
+
+    @property
+    def rests(self) -> Array:
+        """(R, 3, 3) rotations of the centre frame to one whose z is up, in which it can stand or lie on a plane."""
+        return self._stable[0]
+
+    @property
+    def rest_weights(self) -> Array:
+        """(R,) how often each is to be tried, of sum 1: by the root of its probability, so that none is rare."""
+        return self._stable[1]
+
+    @cached_property
+    def main_normal(self) -> Array:
+        """(3,) normal of the direction that most of the surface faces, this way or the other, centre frame."""
+        a, b, c = (self.mesh.vertices[self.mesh.faces[:, i]] for i in range(3))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+        facing = np.abs(self.normals @ self.normals.T) > _ONE_FACE
+        return self.normals[int(np.argmax(facing @ area))]
 
     @cached_property
     def distance(self) -> DistanceField:

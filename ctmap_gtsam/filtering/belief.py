@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
+_DORMANT = 45.0  # nats behind the best class beyond which a class is weighed only when there is a search
 _MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
 _REPORTED = 0.01  # classes less probable than this are not reported with poses
 
@@ -56,8 +57,12 @@ class Belief:
     log_elsewhere: float
     """log evidence of having been moved to where nobody looked"""
     visit: int
+    first_ns: int
+    """of the keyframe that it began with"""
+    present_ns: int
+    """of the last keyframe that found it at its place"""
     time_ns: int
-    """of the last keyframe that had it in view"""
+    """of the last keyframe that had its place in view"""
     viewpoint: Array
     """(3,) from the object to the camera at that keyframe, metres, world frame"""
     visible: bool
@@ -79,6 +84,8 @@ class Reported:
     log_evidence: float
     """of all classes together, nats"""
     existence: float
+    elsewhere: float
+    """P(it was moved to where nobody looked | it exists)"""
     visible: bool
     modes: tuple[tuple[int, float, Array, Array, Array], ...]
     """class index, log weight, T_world_centre (4, 4), covariance (6, 6), free axes (6, f)"""
@@ -123,18 +130,25 @@ class Updater:
         self.proposer = proposer
         self.localisation = localisation
 
-    def start(self, track: Track, observation: Observation, around: Surroundings) -> Belief:
-        """The belief of a track that has just become consistent: a full search for every class."""
-        detection = track.at(observation.keyframe)
-        assert detection is not None
-        view = self.proposer.view(observation, np.array(detection.box), detection, around)
+    def search(self, track: Track, observation: Observation, around: Surroundings) -> tuple[Array, ...]:
+        """A full search for a track that has just become consistent: for each class poses (n, 4, 4) T_camera_centre."""
+        view = self._first_view(track, observation, around)
+        return tuple(
+            self.proposer.search(
+                shape, view, observation, around, self._rng("filter.search", track.track_id, observation, shape)
+            )
+            for shape in self.model.shapes
+        )
+
+    def start(self, track: Track, observation: Observation, around: Surroundings, found: tuple[Array, ...]) -> Belief:
+        """The belief of a track that has just become consistent, from what `search` found of it."""
+        view = self._first_view(track, observation, around)
         n = len(self.model.shapes)
         score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
         count = max(self.model.config.filter.particles // n, self.model.config.filter.min_particles)
         classes = []
-        for shape in self.model.shapes:
+        for shape, starts in zip(self.model.shapes, found, strict=True):
             rng = self._rng("filter.start", track.track_id, observation, shape)
-            starts = self.proposer.search(shape, view, observation, rng)
             proposals = self._in_world(self.proposer.modes(shape, view, starts), observation)
             classes.append(self._weigh(None, proposals, shape, view, observation, count, rng))
         fresh = Belief(
@@ -145,6 +159,8 @@ class Updater:
             log_clutter=0.0,
             log_elsewhere=-np.inf,
             visit=observation.frame.visit,
+            first_ns=observation.frame.time_ns,
+            present_ns=observation.frame.time_ns,
             time_ns=observation.frame.time_ns,
             viewpoint=np.zeros(3),
             visible=True,
@@ -152,6 +168,11 @@ class Updater:
         )
         fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation))
         return replace(fresh, log_clutter=self._clutter(fresh, view, observation))
+
+    def _first_view(self, track: Track, observation: Observation, around: Surroundings) -> View:
+        detection = track.at(observation.keyframe)
+        assert detection is not None
+        return self.proposer.view(observation, np.array(detection.box), detection, around)
 
     def step(
         self, belief: Belief, detection: Detection | None, observation: Observation, around: Surroundings
@@ -168,15 +189,13 @@ class Updater:
         view = self.proposer.view(observation, box, detection, around, share)
         likely = belief.class_log_evidence(self.model)
         counts = self._counts(likely)
-        classes = tuple(
-            self._step_class(belief, shape, view, observation, int(counts[c]), likely[c] > likely.max() - _LIKELY)
-            for c, shape in enumerate(self.model.shapes)
-        )
+        classes = self._step_classes(belief, view, observation, around, counts, likely - likely.max())
         scores = belief.score_sum if detection is None else belief.score_sum + self.model.class_scores(detection)
         moved = replace(
             belief,
             classes=classes,
             score_sum=scores,
+            present_ns=belief.present_ns if detection is None else observation.frame.time_ns,
             time_ns=observation.frame.time_ns,
             viewpoint=viewpoint,
             visible=True,
@@ -214,7 +233,8 @@ class Updater:
             "class": float((belief.score_evidence + self.model.class_evidence(belief.score_sum))[best]),
             "context": float(context[best]),
         }
-        return Reported(probability, there, float(existence), belief.visible, tuple(modes), ledger)
+        elsewhere = float(np.exp(belief.log_elsewhere - np.logaddexp(there, belief.log_elsewhere)))
+        return Reported(probability, there, float(existence), elsewhere, belief.visible, tuple(modes), ledger)
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
@@ -270,8 +290,43 @@ class Updater:
         share = np.exp(mixture.normalised(log_evidence))
         return np.maximum(np.round(settings.particles * share), settings.min_particles).astype(np.int64)
 
+    def _step_classes(
+        self,
+        belief: Belief,
+        view: View,
+        observation: Observation,
+        around: Surroundings,
+        counts: NDArray[np.int64],
+        behind: Array,
+    ) -> tuple[ClassBelief | None, ...]:
+        """Every class; those far behind the best (C,) only now and then: in between they keep their distance to it."""
+        search = self._search_due(belief)
+        awake = search | (behind > -_DORMANT)
+        stepped = {
+            c: self._step_class(belief, shape, view, observation, around, int(counts[c]), behind[c] > -_LIKELY)
+            for c, shape in enumerate(self.model.shapes)
+            if awake[c]
+        }
+        best = int(np.argmax(behind))
+        before, after = belief.classes[best], stepped[best]
+        gained = after.log_evidence - before.log_evidence if before is not None and after is not None else 0.0
+        asleep = (
+            None if own is None else replace(own, log_evidence=own.log_evidence + gained) for own in belief.classes
+        )
+        return tuple(stepped[c] if awake[c] else own for c, own in enumerate(asleep))
+
+    def _search_due(self, belief: Belief) -> bool:
+        return belief.steps % self.model.config.filter.search_every == 0
+
     def _step_class(
-        self, belief: Belief, shape: Shape, view: View, observation: Observation, count: int, likely: bool
+        self,
+        belief: Belief,
+        shape: Shape,
+        view: View,
+        observation: Observation,
+        around: Surroundings,
+        count: int,
+        likely: bool,
     ) -> ClassBelief | None:
         own = belief.classes[shape.index]
         if not likely:
@@ -280,8 +335,8 @@ class Updater:
         starts = np.zeros((0, 4, 4))
         if own is not None:
             starts = observation.frame.T_camera_world @ own.particles.best(3)
-        if view.detection is not None and belief.steps % self.model.config.filter.search_every == 0:
-            found = self.proposer.search(shape, view, observation, rng, self.model.config.filter.search_share)
+        if view.detection is not None and self._search_due(belief):
+            found = self.proposer.search(shape, view, observation, around, rng, self.model.config.filter.search_share)
             starts = np.concatenate([starts, found])
         proposals = self._in_world(self.proposer.modes(shape, view, starts, probe=likely), observation)
         spread = self._spread(observation, belief.time_ns, starts)

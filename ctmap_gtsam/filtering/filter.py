@@ -7,7 +7,9 @@ the weights account for; the context multiplies the reported posterior once, not
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,8 @@ from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
-from ctmap_gtsam.frontend.association import Associator
+from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to
+from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
@@ -24,7 +27,7 @@ from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
 from sequences.progress import SILENT, Progress
-from sequences.types import LocalisationNoise, Run
+from sequences.types import Detection, Frame, LocalisationNoise, Run
 
 Array = NDArray[np.float64]
 
@@ -64,43 +67,87 @@ class _State:
     def __init__(self, run: Run, model: Model, proposer: Proposer) -> None:
         self.model = model
         self.proposer = proposer
-        self.associator = Associator(model.config.frontend)
+        self.associator = Associator(model.config.frontend, model.catalogue)
         self.place = Place(run)
         self.updater = Updater(model, proposer, run.localisation)
         self.beliefs: dict[int, Belief] = {}
+        self.owner: dict[int, int] = {}
+        """track -> object"""
+        self.surest: dict[int, float] = {}
+        """object -> the largest existence it ever had"""
         self.reports: list[dict[int, Reported]] = []
+        self.found_moved: list[tuple[int, tuple[int, int], float]] = []
+        """object, times of its last detection at the old place and its first at the new one, P(it is the same)"""
 
     def step(self, observation: Observation) -> None:
         """Algorithm 1 for every object. Neighbours are those of the keyframe before, so objects have no order."""
         self.associator.step(observation)
         self.place.update(observation)
         before = self.reports[-1] if self.reports else {}
-        reported: dict[int, Reported] = {}
         surroundings = self._surroundings(before)
-        known = [track for track in self.associator.tracks() if track.track_id in self.beliefs]
-        for track in known:
-            i, around = track.track_id, surroundings.without(track.track_id)
-            detection = track.at(observation.keyframe)
+        tracks = self.associator.tracks()
+        reported: dict[int, Reported] = {}
+        for i, detection in self._detections(tracks, observation.keyframe).items():
+            around = surroundings.without(i)
             self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
             reported[i] = self.updater.report(self.beliefs[i], around)
-        self.reports.append(reported | self._start(observation, before))
+        reported |= self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
+        for i, r in reported.items():
+            self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
+        self.reports.append(self._find_moved(reported))
 
-    def _start(self, observation: Observation, before: Mapping[int, Reported]) -> dict[int, Reported]:
-        """Beliefs of tracks that have just become consistent.
+    def _detections(self, tracks: tuple[Track, ...], keyframe: int) -> dict[int, Detection | None]:
+        """Every object's detection, the surest where several of its tracks have one."""
+        out: dict[int, Detection | None] = dict.fromkeys(sorted(self.beliefs))
+        for track in tracks:
+            i, detection = self.owner.get(track.track_id), track.at(keyframe)
+            if i is None or detection is None:
+                continue
+            other = out[i]
+            if other is None or detection.class_scores[1:].max() > other.class_scores[1:].max():
+                out[i] = detection
+        return out
+
+    def _start(
+        self,
+        new: list[Track],
+        observation: Observation,
+        reported: Mapping[int, Reported],
+        before: Mapping[int, Reported],
+    ) -> dict[int, Reported]:
+        """Beliefs of tracks that have just become consistent, but for those of objects that are known.
 
         They know no neighbours among themselves yet, so all start a second time beside those that were sure of
         themselves.
         """
-        new = [track for track in self.associator.tracks() if track.track_id not in self.beliefs]
         started: dict[int, Belief] = {}
-        reported: dict[int, Reported] = {}
+        fresh: dict[int, Reported] = {}
+        alone = self._surroundings(before)
+        found = {track.track_id: self.updater.search(track, observation, alone) for track in new}
         for _ in range(2 if len(new) > 1 else 1):
-            surroundings = self._surroundings({**before, **reported})
+            surroundings = self._surroundings({**before, **fresh})
             for track in new:
-                around = surroundings.without(track.track_id)
-                started[track.track_id] = self.updater.start(track, observation, around)
-            reported = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
-        self.beliefs |= started
+                i = track.track_id
+                started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
+            fresh = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
+        changed: dict[int, Reported] = {}
+        for i, report in fresh.items():
+            known = at_place(report, {**reported, **changed}, self.model)
+            self.owner[i] = i if known is None else known
+            if known is None or {**reported, **changed}[known].existence < min(0.5, report.existence):
+                self.beliefs[self.owner[i]] = replace(started[i], object_id=self.owner[i])
+                changed[self.owner[i]] = report
+        return changed
+
+    def _find_moved(self, reported: dict[int, Reported]) -> dict[int, Reported]:
+        """Objects whose place was found empty and that are met elsewhere go on there."""
+        moved = moved_to(self.beliefs, reported, self.surest)
+        for i, (found, same) in moved.items():
+            between = self.beliefs[i].present_ns, self.beliefs[found].first_ns
+            self.found_moved.append((i, between, same))
+            self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.model)
+            self.owner |= {track: i for track, owner in self.owner.items() if owner == found}
+            reported[i] = reported.pop(found)
         return reported
 
     def _surroundings(self, reports: Mapping[int, Reported]) -> Surroundings:
@@ -118,13 +165,14 @@ class _State:
 
 
 def _estimate(run: Run, model: Model, keyframes: NDArray[np.int64], state: _State) -> Estimate:
-    objects = sorted(state.beliefs)
+    objects = sorted({i for reported in state.reports for i in reported})
     rows = {i: row for row, i in enumerate(objects)}
     tables = Tables(len(objects), len(keyframes), len(model.catalogue))
     for k, reported in enumerate(state.reports):
         for i, r in reported.items():
             r.write(tables, rows[i], k, model)
     frames = [run.frames[int(f)] for f in keyframes]
+    _write_moves(tables, rows, frames, state)
     return build_estimate(
         run,
         model.config,
@@ -139,6 +187,27 @@ def _estimate(run: Run, model: Model, keyframes: NDArray[np.int64], state: _Stat
             **describe(state.place),
         },
     )
+
+
+def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame], state: _State) -> None:
+    """A line for each gap between views that is long enough to hold a move, by what is believed when its visit ends."""
+    times = np.array([frame.time_ns for frame in frames])
+    for i, between, same in state.found_moved:
+        gap = (int(np.searchsorted(times, between[0])), int(np.searchsorted(times, between[1])))
+        tables.move(rows[i], gap, same, between)
+    significant_ns = state.model.config.prediction.significant_period_s * 1e9
+    for i, row in rows.items():
+        seen = [k for k, reported in enumerate(state.reports) if i in reported and reported[i].visible]
+        for a, b in pairwise(seen):
+            if times[b] - times[a] < significant_ns or _within(state.found_moved, i, times[a], times[b]):
+                continue
+            end = max(k for k in seen if frames[k].visit == frames[b].visit)
+            tables.move(row, (a, b), state.reports[end][i].elsewhere, (int(times[a]), int(times[b])))
+
+
+def _within(found: Sequence[tuple[int, tuple[int, int], float]], i: int, begin: int, end: int) -> bool:
+    """Whether an object was found to have moved in a time that overlaps with another."""
+    return any(j == i and between[0] < end and begin < between[1] for j, between, _ in found)
 
 
 def localisation_covariance(noise: LocalisationNoise) -> Array:

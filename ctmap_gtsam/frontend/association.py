@@ -3,6 +3,9 @@
 A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera:
 the overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track.
 A new track counts only after `start_after` consistent frames.
+
+What the image's edge cuts has boxes that can't be predicted so, tables and shelves above all. A box that overlaps no
+prediction is also met where the detector calls it the same and it lies within half that class's diameter of the track.
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ from ctmap_gtsam.frontend.observation import Observation, centre_point
 from ctmap_gtsam.parameters import Frontend
 from factors.measurement import box_iou
 from sequences import se3
+from sequences.catalogue import Catalogue
 from sequences.types import Detection, Frame
 
 Array = NDArray[np.float64]
+
+_SAME_CLASS = 0.5  # least probability that two score vectors mean one class, for a box to be met by its place
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,8 @@ class _Open:
     z: float
     last_ns: int
     streak: int
+    score_sum: Array
+    """(C,) class scores, background left out, each vector of sum 1"""
     keyframes: list[int] = field(default_factory=list)
     detections: list[Detection] = field(default_factory=list)
     started: int | None = None
@@ -57,8 +65,9 @@ class _Open:
 class Associator:
     """Grows tracks from observations in order of time; what it says of a keyframe depends on the past alone."""
 
-    def __init__(self, settings: Frontend) -> None:
+    def __init__(self, settings: Frontend, catalogue: Catalogue) -> None:
         self._settings = settings
+        self._reach_m = np.array([0.5 * c.diameter_m for c in catalogue.classes])
         self._tracks: list[_Open] = []
 
     def step(self, observation: Observation) -> None:
@@ -66,7 +75,7 @@ class Associator:
         frame, detections = observation.frame, observation.frame.detections
         points = [centre_point(frame, observation.depth, np.array(d.box)) for d in detections]
         usable = [i for i, point in enumerate(points) if point is not None]
-        matched = self._match(frame, [detections[i] for i in usable])
+        matched = self._match(frame, [detections[i] for i in usable], [p for p in points if p is not None])
         for track, i in matched.items():
             self._extend(self._tracks[track], observation, detections[usable[i]], points[usable[i]])
         taken = {usable[i] for i in matched.values()}
@@ -83,23 +92,35 @@ class Associator:
             if t.started is not None
         )
 
-    def _match(self, frame: Frame, detections: list[Detection]) -> dict[int, int]:
-        """Hungarian assignment by overlap with the predicted boxes: track -> detection."""
+    def _match(self, frame: Frame, detections: list[Detection], points: list[Array]) -> dict[int, int]:
+        """Hungarian assignment by overlap with the predicted boxes, else by place: track -> detection."""
         if not detections or not self._tracks:
             return {}
         predicted = np.stack([_predicted_box(t, frame) for t in self._tracks])
         boxes = np.array([d.box for d in detections])
         overlap = box_iou(predicted[:, None], boxes[None])
         # what is too small counts nothing, or two that are too small could outweigh one that is not
-        overlap = np.where(overlap >= self._settings.association_iou, overlap, 0.0)
-        rows, columns = linear_sum_assignment(-overlap)
-        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if overlap[r, c] > 0.0}
+        least = self._settings.association_iou
+        affinity = np.where(overlap >= least, overlap, least * self._nearness(detections, points))
+        rows, columns = linear_sum_assignment(-affinity)
+        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if affinity[r, c] > 0.0}
+
+    def _nearness(self, detections: list[Detection], points: list[Array]) -> Array:
+        """(tracks, detections) from 1, in one place and called the same, to 0, further apart than its size allows."""
+        believed = np.stack([t.score_sum / t.score_sum.sum() for t in self._tracks])
+        called = np.stack([_class_shares(d) for d in detections])
+        same = believed @ called.T
+        apart = np.linalg.norm(np.stack([t.point_world for t in self._tracks])[:, None] - np.stack(points), axis=-1)
+        near = np.maximum(1.0 - apart / self._reach_m[np.argmax(believed, axis=1)][:, None], 0.0)
+        given_up = np.array([np.isnan(t.box).any() for t in self._tracks])
+        return np.where((same >= _SAME_CLASS) & ~given_up[:, None], same * near, 0.0)
 
     def _extend(self, track: _Open, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None
         frame = observation.frame
         track.point_world, track.box, track.last_ns = point, np.array(detection.box), frame.time_ns
         track.z = float(se3.transform(frame.T_camera_world, point[None])[0, 2])
+        track.score_sum = track.score_sum + _class_shares(detection)
         track.keyframes.append(observation.keyframe)
         track.detections.append(detection)
         track.streak += 1
@@ -117,9 +138,16 @@ class Associator:
 
     def _open(self, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None
-        track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, 0)
+        nothing = np.zeros(len(self._reach_m))
+        track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, 0, nothing)
         self._tracks.append(track)
         self._extend(track, observation, detection, point)
+
+
+def _class_shares(detection: Detection) -> Array:
+    """(C,) its scores without the background's, of sum 1."""
+    scores = detection.class_scores[1:] + 1e-9
+    return np.asarray(scores / scores.sum())
 
 
 def _predicted_box(track: _Open, frame: Frame) -> Array:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sequences import se3
-from sequences.geometry import Plane, find_planes, up_from_planes
+from sequences.camera import Camera
+from sequences.geometry import Plane, find_planes, plane_depth, up_from_planes
 from sequences.seeds import generator
 from sequences.types import Frame, Run
 
@@ -17,6 +19,11 @@ Array = NDArray[np.float64]
 
 CENTRE_REGION = 0.3
 """share of a box's width and height that the paper's "center region" spans"""
+
+OWN_SHARE = 0.5
+"""a plane with more than this share of what the image shows of it in an object's box may be the object's own face"""
+
+_GRID = 40  # samples across the image for telling where a plane lies
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,14 @@ class Observation:
     def up_camera(self) -> Array | None:
         """(3,) against gravity in the camera frame, as far as this image alone can tell."""
         return up_from_planes(self.planes, np.array([0.0, -1.0, 0.0]))
+
+    def planes_behind(self, box: Array) -> tuple[Plane, ...]:
+        """The planes that may stand behind a thing with a box (x, y, w, h): those that aren't a face of its own."""
+        return tuple(p for p, where in zip(self.planes, self._where, strict=True) if reaches_beyond(where, box))
+
+    @cached_property
+    def _where(self) -> tuple[Array, ...]:
+        return tuple(where_in_image(plane, self.frame.camera) for plane in self.planes)
 
 
 def observe(frame: Frame, keyframe: int, seed: int) -> Observation:
@@ -70,3 +85,19 @@ def centre_point(frame: Frame, depth: NDArray[np.float32], box: Array) -> Array 
     x, y, w, h = box
     point = frame.camera.backproject(np.array(x + w / 2), np.array(y + h / 2), np.array(z))
     return se3.transform(frame.T_world_camera, point[None])[0]
+
+
+def where_in_image(plane: Plane, camera: Camera) -> Array:
+    """(n, 2) pixels spread over the image where a plane in the camera frame would be seen if nothing hid it."""
+    step = max(1, camera.width // _GRID)
+    window = camera.window(0, 0, -(-camera.width // step), -(-camera.height // step), step)
+    v, u = np.nonzero(plane_depth((plane,), window))
+    return np.stack([u, v], axis=-1).astype(np.float64) * step
+
+
+def reaches_beyond(where: Array, box: Array) -> bool:
+    """Whether a plane seen at pixels (n, 2) lies mostly outside of a box (x, y, w, h)."""
+    if not len(where):
+        return True
+    inside = ((where >= box[:2]) & (where <= box[:2] + box[2:])).all(axis=-1)
+    return bool(inside.mean() <= OWN_SHARE)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth
+from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses
 from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine_on_depth, score_depth
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
@@ -34,6 +35,10 @@ ENOUGH_SAMPLES = 40
 _HALF_TURNS = np.stack([np.diag(d).astype(np.float64) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
 _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
 """steps at which the score's shape is probed, metres at the object's radius"""
+_CLIMBS, _CLIMB_NATS = 6, 0.05  # at most so many moves on the score, each gaining at least this much
+_SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
+_EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
+_REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
 
 
@@ -48,7 +53,7 @@ class View:
     share: float = 1.0
     """of the view that is news: its evidence is raised to this power"""
     samples: int = 1
-    """of the full view that one of this tile stands for"""
+    """at the configured angular step that one of this tile stands for"""
 
     def coarse(self) -> View:
         """The same view with a sample in each block of `COARSE` by `COARSE`, where enough are left."""
@@ -81,10 +86,16 @@ class Proposer:
         self.model = model
         self.settings = model.config.frontend
         self.hypotheses_scored = 0
+        self._fine = np.full(self.settings.refinement_steps - self._coarse_steps, self.settings.refinement_widths_m[1])
+
+    @property
+    def _coarse_steps(self) -> int:
+        return max(1, self.settings.refinement_steps // 2)
+
+    def _coarse(self, shape: Shape) -> Array:
+        """Falling widths; furniture is drawn from further away than a mug, by its size."""
         first, last = self.settings.refinement_widths_m
-        steps = self.settings.refinement_steps
-        self._coarse = np.geomspace(first, last, max(1, steps // 2))
-        self._fine = np.full(max(1, steps - len(self._coarse)), last)
+        return np.geomspace(first * max(1.0, shape.reach_m / _SMALL_REACH_M), last, self._coarse_steps)
 
     def view(
         self,
@@ -108,10 +119,12 @@ class Proposer:
         margin = self.settings.region_margin
         region = np.array([x - margin * w, y - margin * h, x + (1 + margin) * w, y + (1 + margin) * h])
         step = max(1, round(camera.fx * self.settings.angular_step_rad))
-        tile = cut_tile(camera, observation.depth, observation.planes, region, step)
+        low, high = np.clip(region.reshape(2, 2), 0.0, [camera.width, camera.height])
+        by = max(1, int(np.ceil(np.sqrt((high - low).prod() / (step**2 * self.settings.tile_samples)))))
+        tile = cut_tile(camera, observation.depth, observation.planes_behind(box), region, by * step)
         if surroundings is not None:
-            tile = surroundings.behind(surroundings.beneath(tile, observation.frame), observation.frame)
-        return View(tile, detection, (camera.width, camera.height), share)
+            tile = surroundings.behind(surroundings.beneath(tile, observation.frame, box), observation.frame)
+        return View(tile, detection, (camera.width, camera.height), share, by**2)
 
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
         """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
@@ -127,7 +140,13 @@ class Proposer:
         return view.share * self.model.log_likelihood(scores, view.detection, view.image_size), scores
 
     def search(
-        self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, share: float = 1.0
+        self,
+        shape: Shape,
+        view: View,
+        observation: Observation,
+        surroundings: Surroundings,
+        rng: np.random.Generator,
+        share: float = 1.0,
     ) -> Array:
         """A fresh search in a view with a detection: refined poses (K, 4, 4) T_camera_centre, not yet sorted out.
 
@@ -135,17 +154,22 @@ class Proposer:
             shape: the class.
             view: where to look.
             observation: the keyframe of the view.
+            surroundings: on whose surfaces it may rest.
             rng: draws the poses.
             share: of the configured effort.
         """
         view = view.coarse()
-        drawn = self._draw(shape, view, observation, rng, max(8, round(share * self.settings.fresh_poses)))
+        drawn = self._draw(
+            shape, view, observation, surroundings, rng, max(8, round(share * self.settings.fresh_poses))
+        )
         if drawn is None:
             return np.zeros((0, 4, 4))
         keep = max(2, round(share * self.settings.refined_poses))
-        coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse)
+        coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
-        around = self._refine(shape, view, self._perturb(shape, best, rng), self._coarse[len(self._coarse) // 2 :])
+        around = self._refine(
+            shape, view, self._perturb(shape, best, rng), self._coarse(shape)[self._coarse_steps // 2 :]
+        )
         return np.concatenate([coarse, around])
 
     def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True) -> PoseModes:
@@ -155,13 +179,18 @@ class Proposer:
             shape: the class.
             view: where to look.
             starts: (K, 4, 4) T_camera_centre.
-            probe: whether covariances come from the score's shape (else from the registration's normal equations).
+            probe: whether to climb along the axes on the score, and to take covariances from its shape (else from the
+                registration's normal equations).
         """
         if len(starts) == 0:
             return _no_modes()
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
         keep = self._distinct(shape, candidates, score)
+        if probe and view.detection is not None:
+            candidates = np.concatenate([self._climb(shape, view, candidates[keep]), candidates[keep]])
+            score, scores = self.score(shape, view, candidates)
+            keep = self._distinct(shape, candidates, score)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe)
         return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance)
@@ -179,27 +208,41 @@ class Proposer:
         z, background, sensor = view.tile.depth, view.tile.background, self.model.config.sensor
         seen = (rendered > 0) & (z > rendered - sensor.occlusion_margin_m)
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        gain = self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
+        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
         box = np.array(view.detection.box)
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
 
     def _draw(
-        self, shape: Shape, view: View, observation: Observation, rng: np.random.Generator, n: int
+        self,
+        shape: Shape,
+        view: View,
+        observation: Observation,
+        surroundings: Surroundings,
+        rng: np.random.Generator,
+        n: int,
     ) -> Array | None:
-        """The paper's first particles: (n, 4, 4)."""
+        """First poses (n, 4, 4): the paper's, and where there are level surfaces, half of them at rest on one."""
         assert view.detection is not None
-        box = np.array(view.detection.box)
+        camera, box = observation.frame.camera, np.array(view.detection.box)
         z = centre_depth(observation.depth, box)
         if z == 0.0:
             return None
-        uniforms = rng.random((n, 6))
-        offsets = (uniforms[:, :2] - 0.5) * CENTRE_REGION + 0.5
-        pixels = box[:2] + offsets * box[2:]
+        uniforms = rng.random((n, 6 + UNIFORMS))
+        low, high = _centre_region(box, view.image_size, shape.reach_m / z)
+        pixels = low + uniforms[:, :2] * (high - low)
+        rays = camera.backproject(pixels[:, 0], pixels[:, 1], np.ones(n))
         # the centre lies behind the surface that is seen, by anything up to its extent
         behind = z + uniforms[:, 2] * np.abs(shape.mesh.vertices).max()
-        centres = observation.frame.camera.backproject(pixels[:, 0], pixels[:, 1], behind)
-        return se3.make(se3.uniform_rotations(uniforms[:, 3:]), centres)
+        anyhow = se3.make(se3.uniform_rotations(uniforms[:, 3:6]), behind[:, None] * rays)
+        surfaces = tuple(s.moved(observation.frame.T_camera_world) for s in surroundings.supports)
+        if not surfaces:
+            return anyhow
+        up = surfaces[0].normal
+        resting = resting_poses(shape, rays, surfaces, observation.planes, up, uniforms[:, 6:])
+        near = np.abs(resting[:, 2, 3] - z) < _REST_REACH * shape.reach_m
+        resting = resting[near][: n // 2]
+        return np.concatenate([resting, anyhow[: n - len(resting)]])
 
     def _best(self, shape: Shape, view: View, poses: Array, n: int) -> Array:
         score, _ = self.score(shape, view, poses)
@@ -235,16 +278,11 @@ class Proposer:
 
         The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
         """
-        hessian = refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
-        unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
-        directions = np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)  # (n, 6 directions, 6)
+        unit, hessian, directions = self._axes(shape, view, poses)
         if not probe:
-            return self._laplace(view.share * hessian, unit)
+            return self._laplace(view.share * view.samples * hessian, unit)
         view = view.coarse()
-        steps = np.concatenate([_LADDER_M, -_LADDER_M])
-        offsets = directions[:, :, None] * steps[:, None] * unit
-        moved = se3.retract(poses[:, None, None], offsets).reshape(-1, 4, 4)
-        around = np.concatenate([poses, moved])
+        around = np.concatenate([poses, _ladder(poses, directions * unit).reshape(-1, 4, 4)])
         depth = view.samples * score_depth(shape.mesh, view.tile, around, self.model.depth_parameters, 0.0).log_ratio
         self.hypotheses_scored += len(around)
         here, there = depth[: len(poses)], depth[len(poses) :].reshape(len(poses), 6, -1)
@@ -253,11 +291,64 @@ class Proposer:
         scaled = directions * unit
         return np.asarray(np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled))
 
+    def _climb(self, shape: Shape, view: View, poses: Array) -> Array:
+        """Poses (n, 4, 4) moved along their axes to where the score is larger, as long as that gains anything.
+
+        Registration doesn't move a flat face along itself: what tells where its edges are is the silhouette. Hiding
+        behind or under something is no gain: at least half of what was to be seen stays so. Not for what the detector
+        doesn't see: something that was taken away would climb into hiding.
+        """
+        view = view.coarse()
+        poses = poses.copy()
+        score, scores = self.score(shape, view, poses)
+        least = 0.5 * scores.visible
+        climbing = np.arange(len(poses))
+        for _ in range(_CLIMBS):
+            unit, _, directions = self._axes(shape, view, poses[climbing])
+            around = _ladder(poses[climbing], directions * unit).reshape(len(climbing), -1, 4, 4)
+            there, scores = self.score(shape, view, around.reshape(-1, 4, 4))
+            in_sight = scores.visible.reshape(len(climbing), -1) >= least[climbing, None]
+            there = np.where(in_sight, there.reshape(len(climbing), -1), -np.inf)
+            best = np.argmax(there, axis=1)
+            gains = there[np.arange(len(climbing)), best] > score[climbing] + _CLIMB_NATS
+            poses[climbing[gains]] = around[gains, best[gains]]
+            score[climbing[gains]] = there[gains, best[gains]]
+            climbing = climbing[gains]
+            if not len(climbing):
+                break
+        return poses
+
+    def _axes(self, shape: Shape, view: View, poses: Array) -> tuple[Array, Array, Array]:
+        """What turns rad into metres (6,), normal equations (n, 6, 6) and their axes (n, 6 directions, 6) so scaled."""
+        hessian = refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
+        unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
+        return unit, hessian, np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)
+
     def _laplace(self, hessian: Array, unit: Array) -> Array:
         sensor = self.model.config.sensor
         scaled = hessian * unit[:, None] * unit * self.model.kappa / sensor.sigma_m**2
         scaled = scaled + np.eye(6) / _LADDER_M[-1] ** 2
         return np.linalg.inv(scaled) * unit[:, None] * unit
+
+
+def _ladder(poses: Array, axes: Array) -> Array:
+    """Poses (n, 6, steps, 4, 4) both ways along axes (n, 6 directions, 6), whose unit is a metre at the surface."""
+    steps = np.concatenate([_LADDER_M, -_LADDER_M])
+    return se3.retract(poses[:, None, None], axes[:, :, None] * steps[:, None])
+
+
+def _centre_region(box: Array, image_size: tuple[int, int], nearness: float) -> tuple[Array, Array]:
+    """Corners (2,) of where in the image a thing's centre may be, for a box (x, y, w, h).
+
+    The paper's centre region; wider where a thing is so large for its distance (`nearness`, its reach over its depth)
+    that its centre isn't seen in the middle of its box, and open to the side where the image's edge cuts the box.
+    """
+    share = min(1.0, CENTRE_REGION * (1.0 + nearness))
+    middle, size, image = box[:2] + box[2:] / 2, box[2:], np.array(image_size)
+    low, high = middle - share * size / 2, middle + share * size / 2
+    low = np.where(box[:2] <= _EDGE_PX, -size / 2, low)
+    high = np.where(box[:2] + size >= image - _EDGE_PX, image + size / 2, high)
+    return low, high
 
 
 def _widths(drop: Array) -> Array:

@@ -272,8 +272,8 @@ def _refine(vertices, faces, solid, normals, poses, camera, depth, widths, hessi
             xi = np.linalg.solve(H, g)
             length = np.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)
             shift = np.sqrt(xi[3] ** 2 + xi[4] ** 2 + xi[5] ** 2)
-            # the linearisation holds for some 15 degrees and some centimetres
-            xi *= min(1.0, 0.3 / max(length, 1e-12), 0.03 / max(shift, 1e-12))
+            # the linearisation holds for some 15 degrees and about as far as depth is drawn to the surface
+            xi *= min(1.0, 0.3 / max(length, 1e-12), max(0.03, widths[step]) / max(shift, 1e-12))
             _move(T, xi)
             if length < 1e-5 and shift < 1e-6:
                 break

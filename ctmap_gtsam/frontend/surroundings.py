@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.observation import reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -19,6 +20,7 @@ from sequences.types import Frame
 Array = NDArray[np.float64]
 
 _CONTENTION_M = 0.012  # things that reach deeper into each other are rivals for one place
+_OWN_M = 0.04  # a surface that lies so near to an object's mesh all over may be its own
 _CONTACTS = 64  # surface points of each of two things that are tested for being inside the other
 
 
@@ -67,9 +69,11 @@ class Surroundings:
         others = (n for n in self.neighbours if n.object_id != object_id)
         return replace(self, neighbours=tuple(n for n in others if own is None or not n.yields_to(own)))
 
-    def beneath(self, tile: Tile, frame: Frame) -> Tile:
-        """The tile with known surfaces as background where this image alone shows none."""
-        known = plane_depth(tuple(s.moved(frame.T_camera_world) for s in self.supports), tile.camera)
+    def beneath(self, tile: Tile, frame: Frame, box: Array) -> Tile:
+        """The tile of a thing with a box (x, y, w, h), with known surfaces behind where this image alone shows none."""
+        surfaces = (s.moved(frame.T_camera_world) for s in self.supports)
+        others = tuple(s for s in surfaces if reaches_beyond(where_in_image(s, frame.camera), box))
+        known = plane_depth(others, tile.camera)
         return replace(tile, background=np.where(tile.background > 0, tile.background, known))
 
     def behind(self, tile: Tile, frame: Frame) -> Tile:
@@ -120,7 +124,7 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
     """How well poses (K, 4, 4) stand on the level surface that suits them best, nats (K,); 0 where none is below.
 
     Floating is a hinge with a floor: a thing may rest on something that was not seen. Sinking has no floor: surfaces
-    are solid. A thing wholly beneath a surface has nothing to do with it.
+    are solid. A thing wholly beneath a surface has nothing to do with it, and a table doesn't stand on its own top.
     """
     settings = model.config.context
     best = np.full(len(T_world_centre), -np.inf)
@@ -130,6 +134,23 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
         floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
         sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
         potential = np.logaddexp(floating, np.log(settings.other_support)) + sinking
-        concerned = plane.contains(T_world_centre[:, :3, 3]) & (high > 0.0)
+        concerned = (
+            plane.contains(T_world_centre[:, :3, 3]) & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
+        )
         best = np.where(concerned, np.maximum(best, potential), best)
     return np.where(np.isneginf(best), 0.0, best)
+
+
+def _own_surface(shape: Shape, T_world_centre: Array, plane: Plane) -> NDArray[np.bool_]:
+    """Whether a surface is part of a shape at poses (K, 4, 4): (K,)."""
+    own = np.zeros(len(T_world_centre), dtype=np.bool_)
+    middle = plane.hull.mean(axis=0)
+    if np.linalg.norm(plane.hull - middle, axis=-1).max() > 2.0 * shape.reach_m:
+        return own
+    # halfway in: the outline reaches beyond what was measured
+    flat = np.concatenate([middle[None], 0.5 * (middle + plane.hull)])
+    points = se3.transform(plane.T_frame_plane, np.concatenate([flat, np.zeros((len(flat), 1))], axis=-1))
+    near = np.linalg.norm(T_world_centre[:, :3, 3] - points[0], axis=-1) < 2.0 * shape.reach_m
+    inside = se3.transform(se3.inverse(T_world_centre[near]), points)
+    own[near] = np.median(np.abs(shape.distance.at(inside)), axis=-1) < _OWN_M
+    return own

@@ -98,7 +98,7 @@ class Found:
 
 def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progress) -> Recording:
     """Associate boxes over the whole run, find the level surfaces and which way is up."""
-    associator, place = Associator(model.config.frontend), Place(run)
+    associator, place = Associator(model.config.frontend, model.catalogue), Place(run)
     planes: list[tuple[Plane, ...]] = []
     with progress.stage("tracks", total=len(keyframes)) as stage:
         for observation in observations(run, keyframes, model.config.seed):
@@ -133,11 +133,12 @@ def _search(found: Found, track: Track, observation: Observation, place: Place, 
     model = proposer.model
     detection = track.at(observation.keyframe)
     assert detection is not None
-    view = proposer.view(observation, np.array(detection.box), detection, Surroundings((), place.surfaces))
+    around = Surroundings((), place.surfaces)
+    view = proposer.view(observation, np.array(detection.box), detection, around)
     for shape in model.shapes:
         stage = f"smoother.search.{shape.source.obj_id}"
         rng = generator(model.config.seed, stage, track.track_id, observation.frame.index)
-        starts = proposer.search(shape, view, observation, rng, model.config.smoother.search_share)
+        starts = proposer.search(shape, view, observation, around, rng, model.config.smoother.search_share)
         modes = proposer.modes(shape, view, starts, probe=False)
         poses = observation.frame.T_world_camera @ modes.T_camera_centre
         found.poses[shape.index] = np.concatenate([found.poses[shape.index], poses])

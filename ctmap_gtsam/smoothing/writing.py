@@ -121,5 +121,4 @@ def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording, s
         times = [frames[int(recording.keyframes[k])].time_ns for k in (a, b)]
         if posterior.moved[i] < 0.5 and (times[1] - times[0]) * 1e-9 < significant_period_s:
             continue
-        none = -(1 << 31)
-        tables.moves.append((row, (a, b), float(posterior.moved[i]), tuple(times), none, none))
+        tables.move(row, (a, b), float(posterior.moved[i]), (times[0], times[1]))

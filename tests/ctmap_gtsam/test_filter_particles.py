@@ -101,7 +101,7 @@ class GaussianProposer:
     def view(self, observation, box, detection, surroundings=None, share=1.0):
         return SimpleNamespace(detection=detection, k=observation.keyframe, share=share)
 
-    def search(self, shape, view, observation, rng, share=1.0):
+    def search(self, shape, view, observation, surroundings, rng, share=1.0):
         return np.zeros((0, 4, 4))
 
     def modes(self, shape, view, starts, probe=True):
@@ -136,6 +136,12 @@ MISSING = (2, 5)
 SCALE = np.repeat([0.02, 0.002], 3)
 
 
+def begun(updater, track, observation):
+    """The belief of a new track that nothing surrounds."""
+    nothing = Surroundings((), ())
+    return updater.start(track, observation, nothing, updater.search(track, observation, nothing))
+
+
 def observation_at(k, detection):
     frame = frame_of(k, np.eye(4), np.zeros((240, 320), np.float32), [detection], time_s=TIMES[k])
     return Observation(k, frame, frame.read_depth(), ())
@@ -165,7 +171,7 @@ def test_where_all_is_gaussian_the_filter_is_kalmans(share):
     detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
     track = Track(0, (0,), (detection,), 0)
     mean, P, evidence = coordinates(measured[0]), covariance[0], model.log_uniform(model.shapes[0])
-    belief = updater.start(track, observation_at(0, detection), Surroundings((), ()))
+    belief = begun(updater, track, observation_at(0, detection))
     few = np.sqrt(n)
     for k in range(len(TIMES)):
         if k:
@@ -200,7 +206,7 @@ def test_a_measurement_in_the_tail_of_the_prediction_is_met_half_way():
     updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise())
     detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
     nothing = Surroundings((), ())
-    belief = updater.start(Track(0, (0,), (detection,), 0), observation_at(0, detection), nothing)
+    belief = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection))
     belief = updater.step(belief, detection, observation_at(1, detection), nothing)
     prior = SCALE[3] ** 2 + model.prediction_covariance(0.3)[3, 3]
     particles = belief.classes[0].particles
@@ -216,7 +222,7 @@ def test_a_thing_that_jumped_is_found_as_likely_as_the_prior_says(jump):
     updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise())
     detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
     nothing = Surroundings((), ())
-    start = updater.start(Track(0, (0,), (detection,), 0), observation_at(0, detection), nothing)
+    start = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection))
     after = updater.step(start, detection, observation_at(1, detection), nothing)
     gained = after.classes[0].log_evidence - start.classes[0].log_evidence
     assert gained == pytest.approx(np.log(jump) + model.log_uniform(model.shapes[0]), abs=0.3)

