@@ -1,129 +1,265 @@
-"""The room itself: floorboards, two walls and what nobody has a model of."""
+"""The room itself: floor, walls, and what hangs on them and stands about though nobody modelled it.
+
+The room's frame: the origin is a corner on the floor, x and y run along two walls into the room, z is up.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sequences import se3
 from sequences.catalogue import Mesh
-from sequences.simulation import solids
-from sequences.simulation.solids import Paint, Solid, moved, plain, rounded_box
+from sequences.simulation import fittings, solids
+from sequences.simulation.lighting import Window
+from sequences.simulation.solids import Paint, baked, moved, plain, rotation
+from sequences.simulation.walls import (
+    RECESS_M,
+    Opening,
+    Parts,
+    boards,
+    carpet,
+    faded,
+    papered,
+    sheet,
+    skirting,
+    tiles,
+    wall,
+    wall_tiles,
+)
 
 Array = NDArray[np.float64]
 
-SIZE_M = 4.2
 HEIGHT_M = 2.6
-PLANK_M = (0.14, 1.3)
+BEFORE_WALL_M = 0.5  # what is nearer to a wall than this stands before it
+DOOR_M = (0.86, 2.05)
+DOOR_CLEAR_M = 1.0  # free floor before a door
+STEP_M = 0.05  # between the places tried for a fitting
+GAP_M = 0.08  # between fittings, and between what stands on the floor
+FLOORS = (boards, boards, tiles, carpet)
+TINTS = ((228, 222, 210), (204, 214, 206), (206, 212, 218), (226, 208, 186), (216, 218, 222), (196, 204, 190))
+ACCENTS = ((150, 172, 160), (140, 158, 178), (196, 150, 120), (176, 166, 190), (206, 184, 130))
+CURTAINS = ((232, 226, 212), (134, 152, 168), (196, 110, 88), (168, 178, 140), (214, 190, 120))
+DOORS = ((236, 234, 228), (176, 130, 86), (206, 200, 188))
+
+
+@dataclass(frozen=True)
+class Room:
+    """What is there besides furniture and things."""
+
+    mesh: Mesh
+    """the room's frame"""
+    window: Window | None
+    """None where no wall had space for one"""
+
+
+@dataclass
+class _Wall:
+    """A wall while it is being furnished."""
+
+    length: float
+    T_room_wall: Array
+    boxes: Array
+    """(n, 2, 3) low and high corners of what stands in the room, wall frame: the room is where y < 0"""
+    openings: list[Opening] = field(default_factory=list)
+    taken: list[Opening] = field(default_factory=list)
+    """what is hung or cut already, with its margin"""
+    parts: Parts = field(default_factory=list)
+    """wall frame"""
+
+    def find(
+        self, width: float, low: float, high: float, rng: np.random.Generator, clear_m: float = BEFORE_WALL_M
+    ) -> Opening | None:
+        """A free rectangle of a width between two heights, nothing within `clear_m` before it; None where none is."""
+        near = self.boxes[(self.boxes[:, 1, 1] > -clear_m) & (self.boxes[:, 1, 2] > low)]
+        blocked = [(b[0, 0], b[1, 0]) for b in near] + [t[:2] for t in self.taken if t[3] > low and t[2] < high]
+        starts = np.arange(GAP_M, self.length - width - GAP_M, STEP_M)
+        for left in rng.permutation(starts):
+            if all(left > b or left + width < a for a, b in blocked):
+                return (float(left), float(left + width), low, high)
+        return None
+
+    def take(self, place: Opening, margin: float = GAP_M) -> None:
+        """Nothing else may hang there."""
+        left, right, low, high = place
+        self.taken.append((left - margin, right + margin, low - margin, high + margin))
+
+
+def room(size: Sequence[float], boxes: Array, rng: np.random.Generator) -> Room:
+    """A room that somebody lives in.
+
+    What it adds keeps clear of what stands in it: a window comes only over low furniture, a door only where one can
+    walk in, plants and baskets only on free floor along the walls, a rug only on free floor.
+
+    Args:
+        size: (2,) along x and y, metres.
+        boxes: (n, 2, 3) least and greatest corner of each piece of furniture, and of any other space to be kept clear,
+            metres, the room's frame.
+        rng: draws all of it.
+    """
+    boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 2, 3)
+    walls = _walls(np.asarray(size, dtype=np.float64), boxes)
+    in_any_order = [walls[int(k)] for k in rng.permutation(4)]
+    door_floor = _add_door(in_any_order, rng)
+    window = _add_window(in_any_order[::-1], rng)
+    _hang_pictures(in_any_order, rng)
+    _paint_walls(walls, rng)
+    floor: Parts = FLOORS[int(rng.integers(len(FLOORS)))](size, rng)
+    ceiling = sheet((0.0, 0.0, HEIGHT_M), (0.0, size[1], 0.0), (size[0], 0.0, 0.0), 8, 8)
+    kept_clear = [*(b[:, :2] for b in boxes), *door_floor]
+    parts: Parts = [
+        *floor,
+        (ceiling, plain((246, 245, 242))),
+        *(part for w in walls for part in _put(w.parts, w.T_room_wall)),
+        *_stand_about(walls, kept_clear, rng),
+        *_lay_rug(np.asarray(size, dtype=np.float64), kept_clear, rng),
+    ]
+    return Room(solids.join(parts), window)
+
+
+def _walls(size: Array, boxes: Array) -> list[_Wall]:
+    """The four, each turned so that one sees it from inside."""
+    x, y = size
+    corners = [(x, 0.0, y, 0.0), (y, -90.0, y, x), (x, 180.0, 0.0, x), (y, 90.0, 0.0, 0.0)]
+    walls = []
+    for length, yaw, at_y, at_x in corners:
+        T_room_wall = se3.make(rotation("z", yaw), np.array([at_x, at_y, 0.0]))
+        local = se3.transform(se3.inverse(T_room_wall), boxes.reshape(-1, 3)).reshape(-1, 2, 3)
+        walls.append(_Wall(float(length), T_room_wall, np.stack([local.min(axis=1), local.max(axis=1)], axis=1)))
+    return walls
+
+
+def _put(parts: Parts, T: Array) -> Parts:
+    """Parts moved by T (4, 4), their colours kept."""
+    return [(moved(solid, T[:3, 3], T[:3, :3]), baked(paint, solid)) for solid, paint in parts]
+
+
+def _add_door(walls: Sequence[_Wall], rng: np.random.Generator) -> list[Array]:
+    """A door in the first wall that has space; what floor (2, 2) must stay free before it, if any."""
+    colour = DOORS[int(rng.integers(len(DOORS)))]
+    for w in walls:
+        place = w.find(DOOR_M[0], 0.0, DOOR_M[1], rng, clear_m=DOOR_CLEAR_M)
+        if place is not None:
+            w.openings.append(place)
+            w.take(place, margin=0.16)
+            right_of_it = place[1] + 0.2 < w.length - 0.1
+            w.parts += [
+                *fittings.door(place, colour),
+                *fittings.switch(place[1] + 0.2 if right_of_it else place[0] - 0.2, 1.1),
+            ]
+            corners = np.array([[place[0], 0.0, 0.0], [place[1], -DOOR_CLEAR_M, 0.0]])
+            there = se3.transform(w.T_room_wall, corners)[:, :2]
+            return [np.stack([there.min(axis=0), there.max(axis=0)])]
+    return []
+
+
+def _add_window(walls: Sequence[_Wall], rng: np.random.Generator) -> Window | None:
+    """A window with curtains in the first wall that has space, a radiator under it where that is free."""
+    low, high, width = 0.95, 2.15, float(rng.uniform(1.0, 1.5))
+    colour, long = CURTAINS[int(rng.integers(len(CURTAINS)))], bool(rng.random() < 0.5)
+    side = 0.36  # of a curtain beside the opening
+    for w in walls:
+        place = w.find(width + 2.0 * side, low - 0.1, high + 0.2, rng)
+        if place is None:
+            continue
+        opening = (place[0] + side, place[1] - side, low, high)
+        w.openings.append(opening)
+        w.take(place)
+        floor_is_free = not any(b[1, 1] > -BEFORE_WALL_M and b[0, 0] < place[1] and b[1, 0] > place[0] for b in w.boxes)
+        w.parts += [*fittings.window(opening, rng), *fittings.curtains(opening, colour, long and floor_is_free)]
+        if floor_is_free:
+            w.parts += fittings.radiator(opening)
+        middle = np.array([(opening[0] + opening[1]) / 2.0, RECESS_M - 0.01, (low + high) / 2.0])
+        return Window(w.T_room_wall @ se3.make(np.eye(3), middle), np.array([width, high - low]))
+    return None
+
+
+def _hang_pictures(walls: Sequence[_Wall], rng: np.random.Generator) -> None:
+    """One to three pictures a wall as far as there is space, and a clock on one of them."""
+    for k, w in enumerate(walls):
+        if k == 0 and (place := w.find(0.3, 1.75, 2.05, rng)) is not None:
+            w.take(place)
+            w.parts += fittings.clock((place[0] + place[1]) / 2.0, 1.9)
+        for _ in range(int(rng.integers(1, 4))):
+            wide, tall = [(0.6, 0.42), (0.42, 0.6), (0.32, 0.32), (0.8, 0.55)][int(rng.integers(4))]
+            z = 1.5 + rng.uniform(-0.08, 0.08)
+            place = w.find(wide, z - tall / 2.0, z + tall / 2.0, rng)
+            if place is not None:
+                w.take(place, margin=0.12)
+                w.parts += fittings.picture((place[0] + place[1]) / 2.0, z, (wide, tall), rng)
+
+
+def _paint_walls(walls: Sequence[_Wall], rng: np.random.Generator) -> None:
+    """One tint all round; one wall is papered, tiled or of another colour."""
+    tint = TINTS[int(rng.integers(len(TINTS)))]
+    accent, special = ACCENTS[int(rng.integers(len(ACCENTS)))], int(rng.integers(4))
+    kind = int(rng.integers(3))
+    for k, w in enumerate(walls):
+        paint: Paint = faded(tint, rng)
+        if k == special:
+            paint = papered(accent, rng) if kind == 0 else faded(accent if kind == 1 else tint, rng)
+        doors = [o for o in w.openings if o[2] == 0.0]
+        w.parts += wall(w.length, HEIGHT_M, w.openings, paint, step=0.05 if (k, kind) == (special, 0) else 0.3)
+        w.parts += skirting(w.length, doors)
+        if (k, kind) == (special, 2):
+            w.parts += wall_tiles(w.length, 1.35, [(o[0] - 0.08, o[1] + 0.08, *o[2:]) for o in w.openings], accent, rng)
+
+
+def _stand_about(walls: Sequence[_Wall], kept_clear: Sequence[Array], rng: np.random.Generator) -> Parts:
+    """A plant, a lamp and one or two baskets on free floor along the walls."""
+    parts, blocked = [], [*kept_clear]
+    wanted = [(0.46, fittings.plant(rng)), (0.5, fittings.floor_lamp()), (0.44, fittings.floor_basket(rng))]
+    for width, thing in wanted[: 2 + int(rng.integers(2))]:
+        places = [(w, x) for w in walls for x in np.arange(width / 2.0 + 0.05, w.length - width / 2.0 - 0.05, 0.1)]
+        # corners first, as people do
+        distance = [min(x, w.length - x) + rng.uniform(0.0, 0.6) for w, x in places]
+        for k in np.argsort(distance):
+            w, x = places[int(k)]
+            (at,) = se3.transform(w.T_room_wall, np.array([[x, -width / 2.0 - 0.06, 0.0]]))
+            square = np.stack([at[:2] - width / 2.0, at[:2] + width / 2.0])
+            hung = [t for t in w.taken if t[2] < 1.6 and t[1] > x - width / 2.0 and t[0] < x + width / 2.0]
+            if not hung and not any(_overlap(square, b) for b in blocked):
+                blocked.append(square)
+                turn = rotation("z", float(rng.uniform(0.0, 360.0)) if width > 0.45 else float(rng.uniform(-8.0, 8.0)))
+                parts += _put(thing, se3.make(turn, at))
+                break
+    return parts
+
+
+def _overlap(a: Array, b: Array) -> bool:
+    """Whether two level rectangles, (2, 2) low and high corner, come nearer than a gap."""
+    return bool((a[0] < b[1] + GAP_M).all() and (b[0] < a[1] + GAP_M).all())
+
+
+def _lay_rug(size: Array, kept_clear: Sequence[Array], rng: np.random.Generator) -> Parts:
+    """A rug on the largest free piece of floor that a few tries find, but nowhere if that is small."""
+    best: Array | None = None
+    for _ in range(300):
+        extent = rng.uniform((1.0, 0.8), (2.2, 1.5)) if rng.random() < 0.5 else rng.uniform((0.8, 1.0), (1.5, 2.2))
+        if (extent + 0.6 > size).any():
+            continue
+        low = rng.uniform(0.3, size - extent - 0.3)
+        field_ = np.stack([low, low + extent])
+        if any(_overlap(field_, b) for b in kept_clear):
+            continue
+        if best is None or np.prod(extent) > np.prod(best[1] - best[0]):
+            best = field_
+    return [] if best is None else fittings.rug(best[0], best[1], rng)
 
 
 def room_mesh(side: int, table_at: Array, rng: np.random.Generator) -> Mesh:
-    """Floor, walls, skirting, a picture over the table, a basket under it and a plant beside it.
+    """A room of 4.2 x 4.2 m whose corner between the table's wall y = 0 and the shelf's wall x = 0 is the origin.
 
     Args:
-        side: sign of x inside the room.
+        side: sign of x inside the room; y < 0 there.
         table_at: (3,) centre of the table, world frame.
-        rng: tints and where exactly things hang and stand.
+        rng: draws all of it.
     """
-    walls = [(225, 216, 200), (150, 172, 160), (196, 206, 214), (222, 200, 176)]
-    tints = [walls[k] for k in rng.permutation(len(walls))[:2]]
-    x = float(table_at[0])
-    skirting = plain((238, 236, 230))
-    parts: list[tuple[Solid, Paint]] = [
-        (_wall("y", side), _faded(tints[0], rng)),
-        (_wall("x", side), _faded(tints[1], rng)),
-        (moved(rounded_box((SIZE_M, 0.015, 0.08), 0.003), (side * SIZE_M / 2, -0.0075, 0.04)), skirting),
-        (moved(rounded_box((0.015, SIZE_M, 0.08), 0.003), (side * 0.0075, -SIZE_M / 2, 0.04)), skirting),
-        *_picture(x + rng.uniform(-0.25, 0.25), rng),
-        *_basket(x + side * rng.uniform(0.1, 0.35)),
-        *_plant(x + side * rng.uniform(0.95, 1.05), rng),
-    ]
-    return solids.join([*parts, *_floor(side, rng)])
-
-
-def _sheet(origin: Sequence[float], u: Sequence[float], v: Sequence[float], n: int, m: int) -> Solid:
-    """A rectangle cut into n x m pieces, facing along u x v."""
-    s, t = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, m + 1), indexing="ij")
-    vertices = np.asarray(origin) + s.reshape(-1, 1) * np.asarray(u) + t.reshape(-1, 1) * np.asarray(v)
-    index = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
-    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
-    return vertices, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).astype(np.int32)
-
-
-def _wall(axis: str, side: int) -> Solid:
-    """The plane y = 0 facing -y, or the plane x = 0 facing the room."""
-    left = min(0.0, side * SIZE_M)
-    if axis == "y":
-        return _sheet((left, 0.0, 0.0), (SIZE_M, 0.0, 0.0), (0.0, 0.0, HEIGHT_M), 14, 9)
-    start, run = (-SIZE_M, SIZE_M) if side > 0 else (0.0, -SIZE_M)
-    return _sheet((0.0, start, 0.0), (0.0, run, 0.0), (0.0, 0.0, HEIGHT_M), 14, 9)
-
-
-def _faded(colour: tuple[int, int, int], rng: np.random.Generator) -> Paint:
-    phase = rng.uniform(0.0, 2 * np.pi, 3)
-
-    def paint(vertices: Array) -> Array:
-        along = vertices[:, 0] + vertices[:, 1]
-        tone = 1.0 + 0.025 * np.sin(1.7 * along + phase[0]) * np.sin(2.3 * vertices[:, 2] + phase[1])
-        return np.asarray(colour) * tone[:, None]
-
-    return paint
-
-
-def _floor(side: int, rng: np.random.Generator) -> list[tuple[Solid, Paint]]:
-    """Boards along x, each with its own tone, the joints staggered."""
-    boards: list[tuple[Solid, Paint]] = []
-    base, width, length = np.array((158.0, 120.0, 82.0)), PLANK_M[0], PLANK_M[1]
-    for row in range(int(np.ceil(SIZE_M / width))):
-        start = -float(rng.uniform(0.0, length))
-        while start < SIZE_M:
-            low, high = max(0.0, start), min(SIZE_M, start + length)
-            left = low if side > 0 else -high
-            corner = (left, 0.002 - (row + 1) * width, 0.0)
-            sheet = _sheet(corner, (high - low - 0.002, 0.0, 0.0), (0.0, width - 0.004, 0.0), 3, 1)
-            boards.append((sheet, plain(base * (1.0 + 0.08 * rng.standard_normal()))))
-            start += length
-    left = min(0.0, side * SIZE_M)
-    joints = _sheet((left, -SIZE_M, -0.002), (SIZE_M, 0.0, 0.0), (0.0, SIZE_M, 0.0), 8, 8)
-    return [*boards, (joints, plain((88, 64, 42)))]
-
-
-def _picture(x: float, rng: np.random.Generator) -> list[tuple[Solid, Paint]]:
-    """A framed landscape of 0.6 x 0.42 m: meadow, hills and sky, one strip each."""
-    phase = rng.uniform(0.0, 2 * np.pi, 3)
-    at = np.linspace(-1.0, 1.0, 33)
-    meadow = 0.3 + 0.08 * np.sin(2.6 * at + phase[0])
-    hills = 0.58 + 0.1 * np.sin(3.6 * at + phase[1]) * np.sin(9.0 * at + phase[2])
-    edges = [np.zeros_like(at), meadow, hills, np.ones_like(at)]
-    colours = [(98, 134, 70), (98, 124, 140), (186, 208, 224)]
-    parts = [(moved(rounded_box((0.6, 0.022, 0.42), 0.004), (x, -0.013, 1.28)), plain((62, 44, 34)))]
-    for low, high, colour in zip(edges[:-1], edges[1:], colours, strict=True):
-        vertices, faces = _sheet((0.0, -0.0245, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), len(at) - 1, 1)
-        column = np.rint(vertices[:, 0] * (len(at) - 1)).astype(int)
-        height = np.where(vertices[:, 2] > 0.5, high[column], low[column])
-        strip = np.stack([x + 0.265 * at[column], vertices[:, 1], 1.105 + 0.35 * height], axis=-1)
-        parts.append(((strip, faces), plain(colour)))
-    return parts
-
-
-def _basket(x: float) -> list[tuple[Solid, Paint]]:
-    """A cardboard box on the floor under the table."""
-    tape = solids.bands(0, [x - 0.03, x + 0.03], [(184, 142, 94), (210, 186, 140), (184, 142, 94)])
-    return [(moved(rounded_box((0.4, 0.3, 0.26), 0.004, ((-0.03, 0.03), (), ())), (x, -0.3, 0.13)), tape)]
-
-
-def _plant(x: float, rng: np.random.Generator) -> list[tuple[Solid, Paint]]:
-    """A pot with long leaves."""
-    profile = [[0.0, 0.0], [0.10, 0.0], [0.14, 0.24], [0.145, 0.28], [0.13, 0.28], [0.125, 0.25], [0.0, 0.25]]
-    pot = solids.lathe(profile, 24)
-    parts = [(moved(pot, (x, -0.25, 0.0)), solids.bands(2, [0.2499], [(176, 98, 66), (120, 74, 52)]))]
-    for k in range(11):
-        turn, reach, rise = 2.4 * k + rng.uniform(-0.3, 0.3), rng.uniform(0.12, 0.22), rng.uniform(0.5, 0.95)
-        s = np.linspace(0.0, 1.0, 7)
-        out = 0.03 + reach * s**2
-        leaf = np.stack([out * np.cos(turn), out * np.sin(turn), 0.25 + rise * (s - 0.25 * s**3)], axis=-1)
-        width = 0.022 * np.sin(np.pi * (0.12 + 0.86 * s))
-        green = np.array((64, 118, 62)) * rng.uniform(0.8, 1.25)
-        parts.append((moved(solids.tube(leaf, width, 6, flatten=0.15), (x, -0.25, 0.0)), plain(green)))
-    return parts
+    corner = np.array([min(0.0, side * 4.2), -4.2, 0.0])
+    table = np.array([[table_at[0] - 0.65, -0.75, 0.0], [table_at[0] + 0.65, 0.0, 0.75]])
+    shelf = np.sort(np.array([[0.0, -2.1, 0.0], [side * 0.4, -0.7, 1.5]]), axis=0)
+    made = room((4.2, 4.2), np.stack([table, shelf]) - corner, rng).mesh
+    return Mesh(made.vertices + corner, made.faces, made.colours)

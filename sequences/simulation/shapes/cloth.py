@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 
 THICK_M = 0.0015
 OVERHANG_M = 0.2
-CORNER_M = 0.03  # radius of the cloth's bend round the top's corners
+CORNER_M = 0.008  # radius of the cloth's bend round the top's corners
 OFF_M = 0.006  # from the top's edge
+LINING_M = 0.004  # between the skins of the hanging part, whose quads are cut along different diagonals
 COLOURS = (((226, 220, 206), (150, 58, 52)), ((188, 206, 214), (244, 244, 240)), ((178, 60, 58), (240, 232, 216)))
 """ground and lines"""
 
@@ -60,7 +61,7 @@ def _sections(half: Array, hang: float, phases: Array) -> tuple[Array, list[bool
     above = [(_level(half, inset, THICK_M), line) for inset, line in [*_line(0.1, 0.085), (0.01, False), (0.0, False)]]
     drops = [(0.04, False), (0.25, False), (0.5, False), *_line(0.78, 0.88), (1.0, False)]
     outside = [(_skirt(half, drop, hang, phases, OFF_M), line) for drop, line in drops]
-    inside = [(_skirt(half, drop, hang, phases, OFF_M - THICK_M), False) for drop in (1.0, 0.5, 0.25, 0.04)]
+    inside = [(_skirt(half, drop, hang, phases, OFF_M - LINING_M), False) for drop, _ in drops[::-1]]
     below = [(_level(half, inset, -1e-4), False) for inset in (0.0, 0.1)]
     rings = [*above, *outside, *inside, *below]
     return np.stack([points for points, _ in rings]), [line for _, line in rings]
@@ -96,7 +97,7 @@ def _outline(half: Array) -> tuple[Array, Array, Array]:
         normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         centre = (half - CORNER_M) * (i, j)
         side = (half - CORNER_M) * ((-1, 1), (-1, -1), (1, -1), (1, 1))[k]  # the next corner
-        run = np.linspace(0.0, 1.0, 30)[1:-1, None]
+        run = np.linspace(0.0, 1.0, 46)[1:-1, None]
         bend = centre + CORNER_M * normal
         points += [bend, bend[-1] + run * (side - centre)]
         outwards += [normal, np.broadcast_to(normal[-1], (len(run), 2))]
