@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
 _DORMANT = 45.0  # nats behind the best class beyond which a class is weighed only when there is a search
+_IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
 _MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
 _REPORTED = 0.01  # classes less probable than this are not reported with poses
 
@@ -218,7 +219,8 @@ class Updater:
             context[c] = float(log_sum(joint))
             weighted.append((own, mixture.normalised(joint)))
         probability = np.exp(mixture.normalised(log_evidence + context))
-        there = float(log_sum(log_evidence))
+        # a solid thing can't be where another or a surface is: context decides on existence, too
+        there = float(log_sum(log_evidence + context))
         rivals = np.logaddexp(np.logaddexp(belief.log_clutter, 0.0), belief.log_elsewhere)
         existence = 1.0 / (1.0 + np.exp(np.clip(rivals - there, -700.0, 700.0)))
         modes: list[tuple[int, float, Array, Array, Array]] = []
@@ -383,17 +385,20 @@ class Updater:
         if proposals is not None:
             drawn.append(proposals.draw(n_proposed, shape, rng))
         T = np.concatenate(drawn)
-        log_prior = np.full(len(T), log_uniform)
+        score, scores = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
+        log_prior = log_drawn = np.full(len(T), log_uniform)
         if own is not None and spread is not None:
             jump = self.model.config.prediction.jump_probability
-            predicted = predicted_log_density(own.particles, T, spread, shape)
-            log_prior = np.logaddexp(np.log1p(-jump) + predicted, np.log(jump) + log_uniform)
-        log_q = log_prior
+            stayed = np.log1p(-jump) + predicted_log_density(own.particles, T, spread, shape)
+            log_drawn = np.logaddexp(stayed, np.log(jump) + log_uniform)
+            # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
+            seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
+            log_prior = np.where(seen, log_drawn, stayed)
+        log_q = log_drawn
         if proposals is not None:
             # the prior is part of the mixture, so no weight exceeds the likelihood by more than 1 / (1 - share)
             proposed = np.log(share) + proposals.log_density(T, shape)
-            log_q = proposed if own is None else np.logaddexp(np.log1p(-share) + log_prior, proposed)
-        score, _ = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
+            log_q = proposed if own is None else np.logaddexp(np.log1p(-share) + log_drawn, proposed)
         log_weight = log_prior + score - log_q
         gained = float(log_sum(log_weight)) - np.log(len(T))
         before = 0.0 if own is None else own.log_evidence

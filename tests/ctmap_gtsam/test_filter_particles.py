@@ -13,6 +13,7 @@ from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predic
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.observation import Observation
 from ctmap_gtsam.frontend.proposer import PoseModes
+from ctmap_gtsam.frontend.scoring import Scores
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from factors import mixture, prediction
@@ -117,12 +118,16 @@ class GaussianProposer:
 
     def score(self, shape, view, T):
         if view.k not in self.measured:
-            return np.zeros(len(T)), None
+            return np.zeros(len(T)), in_sight(len(T))
         r = coordinates(T) - coordinates(self.measured[view.k])
-        return mixture.gaussian_log_density(r, np.linalg.inv(self.covariance[view.k])), None
+        return mixture.gaussian_log_density(r, np.linalg.inv(self.covariance[view.k])), in_sight(len(T))
 
     def log_clutter(self, shape, view, T):
         return 0.0
+
+
+def in_sight(n):
+    return Scores(np.zeros(n), np.ones(n), np.ones(n), np.zeros((n, 4)))
 
 
 def coordinates(T):
