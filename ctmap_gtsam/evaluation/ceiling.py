@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate, Ledger, Modes, Moves
+from ctmap_gtsam.evaluation.matching import from_truth, shapes_of
+from ctmap_gtsam.evaluation.moves import Period, true_periods
 from sequences.types import VISIBLE_FRACTION, Run, TrueObject, Truth
 
 Array = NDArray[np.float64]
@@ -14,6 +16,7 @@ Ints = NDArray[np.int64]
 NAME = "truth"
 """Of the method"""
 
+_UNKNOWN = -(1 << 31)  # a support that isn't said, as estimators write it
 _SIGMA = 1e-6  # rad and metres: a covariance has to have an inverse
 
 
@@ -29,6 +32,7 @@ def truth_estimate(run: Run, truth: Truth) -> Estimate:
         in_view[n, thing.frames] = thing.visible_fraction >= VISIBLE_FRACTION
         probability[n, :, run.catalogue.index(thing.obj_id)] = 1.0
     none = np.zeros(0, dtype=np.int64)
+    moved = [p for p in true_periods(run, truth, from_truth(run, truth), shapes_of(run.catalogue)) if p.moved]
     return Estimate(
         object_id=np.array([thing.inst_id for thing in truth.objects], dtype=np.int64),
         class_ids=class_ids,
@@ -41,7 +45,7 @@ def truth_estimate(run: Run, truth: Truth) -> Estimate:
         T_world_camera=truth.T_world_camera,
         camera_covariance=np.tile(_SIGMA**2 * np.eye(6), (len(frames), 1, 1)),
         modes=_modes(truth.objects),
-        moves=Moves(none, none.reshape(0, 2), np.zeros(0), none.reshape(0, 2), none, none),
+        moves=_moves(moved),
         ledger=Ledger(none, none, none, none, np.zeros(0)),
         meta={
             "method": NAME,
@@ -49,6 +53,20 @@ def truth_estimate(run: Run, truth: Truth) -> Estimate:
             "run": run.name,
             "recorded_T_world_camera": [frame.T_world_camera.tolist() for frame in run.frames],
         },
+    )
+
+
+def _moves(moved: list[Period]) -> Moves:
+    """One gap a period with a move, at its time where that is known."""
+    interval = [(min(p.moved_ns), max(p.moved_ns)) if p.moved_ns else p.times_ns for p in moved]
+    unknown = np.full(len(moved), _UNKNOWN, dtype=np.int64)
+    return Moves(
+        object=np.array([p.object for p in moved], dtype=np.int64),
+        gap=np.array([p.frames for p in moved], dtype=np.int64).reshape(-1, 2),
+        probability=np.ones(len(moved)),
+        interval_ns=np.array(interval, dtype=np.int64).reshape(-1, 2),
+        from_support=unknown,
+        to_support=unknown,
     )
 
 

@@ -7,6 +7,7 @@ boxes' centres, stays finite. A median is infinite where half of the object-fram
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -16,6 +17,9 @@ from ctmap_gtsam.evaluation import detection, pose
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
 from ctmap_gtsam.evaluation.pose import Shape
 from ctmap_gtsam.evaluation.statistics import log_score, mean, median
+from ctmap_gtsam.evaluation.vsd import SHARES, vsd_recall
+from sequences.camera import Camera
+from sequences.types import Run
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,8 +32,24 @@ POSES = (
     "translation_mm_median",
     "rotation_deg_median",
     "posed_share",
+    "pose_2cm_10deg",
+    "pose_5cm_15deg",
+    "add_auc",
+    "adds_auc",
+    "mssd_recall",
+    "mspd_recall",
+    "vsd_recall",
+    "bop_recall",
 )
-"""Metrics that need poses. posed_share: how many object-frames have a pose of the true class"""
+"""Metrics that need poses. posed_share: how many object-frames have a pose of the true class. pose_*: how many are
+within both thresholds. *_auc: area under the curve of accuracy over the threshold, up to AUC_M (Xiang et al., PoseCNN,
+RSS 2018). *_recall: BOP's average recalls (Hodan et al., BOP Challenge 2020, ECCV Workshops 2020), and their mean"""
+
+AUC_M = 0.1
+"""Where PoseCNN's curves end"""
+
+THRESHOLDS = {"2cm_10deg": (0.02, np.deg2rad(10.0)), "5cm_15deg": (0.05, np.deg2rad(15.0))}
+"""The named points of the curves of pose accuracy, metres and rad"""
 
 CLASSES = ("class_accuracy", "class_accuracy_last_half", "class_log_score", "class_brier_score")
 """Metrics that need none. class_accuracy_last_half: over the second half of each run's frames. The scores are of the
@@ -60,16 +80,26 @@ class FrameErrors:
     mssd_m: Array
     add_m: Array
     adds_m: Array
+    mssd_recall: Array
+    """share of BOP's ten thresholds, 5 to 50 % of the diameter, that MSSD is below"""
+    mspd_recall: Array
+    """the same of MSPD, 5 to 50 pixels of an image 640 pixels wide"""
+    vsd_recall: Array
+    """share of BOP's hundred pairs of tolerance and threshold that VSD passes; NaN in frames where it isn't asked"""
 
     def at(self, where: Bools) -> FrameErrors:
         """Those of some object-frames (N, F), in one row."""
         return FrameErrors(**{f.name: getattr(self, f.name)[where] for f in fields(self)})
 
 
-def frame_errors(method: MethodMap, truth: ObjectFrames, matching: Matching, shapes: dict[int, Shape]) -> FrameErrors:
-    """(N, F) how a method fares at the true objects, by `matching`."""
+def frame_errors(
+    run: Run, method: MethodMap, truth: ObjectFrames, matching: Matching, shapes: dict[int, Shape], step: int
+) -> FrameErrors:
+    """(N, F) how a method fares at the true objects, by `matching`; for VSD every `step`-th pixel is looked at."""
     said = detection.matched_class(method.objects, matching)
-    translation, rotation, mssd, add, adds = (np.where(truth.visible, np.inf, np.nan) for _ in range(5))
+    translation, rotation, mssd, add, adds, mspd = (np.where(truth.visible, np.inf, np.nan) for _ in range(6))
+    diameters, widths = np.ones(truth.visible.shape), np.array([frame.camera.width for frame in run.frames])
+    cameras = [frame.camera for frame in run.frames]
     for n, row in enumerate(matching.row):
         for true_id, said_id in np.unique(np.stack([truth.class_id[n], said[n]], axis=1), axis=0):
             f = truth.visible[n] & (truth.class_id[n] == true_id) & (said[n] == said_id)
@@ -79,8 +109,10 @@ def frame_errors(method: MethodMap, truth: ObjectFrames, matching: Matching, sha
             T_true, T = truth.T_camera_object[n, f], method.objects.T_camera_object[row, f]
             translation[n, f] = pose.translation_error(other, T, true, T_true)
             if said_id == true_id:
+                diameters[n, f] = true.of.diameter_m
                 rotation[n, f] = pose.rotation_error(true, T, T_true)
                 mssd[n, f], add[n, f], adds[n, f] = (e(true, T, T_true) for e in (pose.mssd, pose.add, pose.adds))
+                mspd[n, f] = _mspd(true, T, T_true, [cameras[k] for k in np.flatnonzero(f)])
     beliefs = [detection.belief(method, int(row), truth.class_id[n]) for n, row in enumerate(matching.row)]
     return FrameErrors(
         late=_late(truth),
@@ -93,7 +125,24 @@ def frame_errors(method: MethodMap, truth: ObjectFrames, matching: Matching, sha
         mssd_m=mssd,
         add_m=add,
         adds_m=adds,
+        mssd_recall=_recall(mssd / diameters),
+        mspd_recall=_recall(mspd / widths * (640.0 / 100.0)),  # 5 px of 640 is the least threshold, as 5 % is
+        vsd_recall=vsd_recall(run, truth, method.objects, matching, step),
     )
+
+
+def _mspd(shape: Shape, T: Array, T_true: Array, cameras: Sequence[Camera]) -> Array:
+    """(n,) of poses (n, 4, 4) in n images."""
+    out = np.empty(len(cameras))
+    for camera in dict.fromkeys(cameras):
+        k = np.array([one == camera for one in cameras])
+        out[k] = pose.mspd(shape, T[k], T_true[k], camera)
+    return out
+
+
+def _recall(error: Array) -> Array:
+    """Share of the thresholds that errors (...) are below; NaN where they are."""
+    return np.where(np.isnan(error), np.nan, (error[..., None] < SHARES).mean(axis=-1))
 
 
 def detector_errors(score: detection.DetectorScore, truth: ObjectFrames) -> FrameErrors:
@@ -110,11 +159,19 @@ def detector_errors(score: detection.DetectorScore, truth: ObjectFrames) -> Fram
         mssd_m=nothing,
         add_m=nothing,
         adds_m=nothing,
+        mssd_recall=nothing,
+        mspd_recall=nothing,
+        vsd_recall=nothing,
     )
 
 
 def pose_metrics(errors: FrameErrors) -> dict[str, float | None]:
-    """POSES over the object-frames (n,) given."""
+    """POSES over the object-frames (n,) given; vsd_recall over those that it was measured in."""
+    recalls = {
+        "mssd_recall": mean(errors.mssd_recall),
+        "mspd_recall": mean(errors.mspd_recall),
+        "vsd_recall": mean(errors.vsd_recall[np.isfinite(errors.vsd_recall)]),
+    }
     return {
         "mssd_mm_median": median(1e3 * errors.mssd_m),
         "adds_mm_median": median(1e3 * errors.adds_m),
@@ -122,7 +179,40 @@ def pose_metrics(errors: FrameErrors) -> dict[str, float | None]:
         "translation_mm_median": median(1e3 * errors.translation_m),
         "rotation_deg_median": median(np.rad2deg(errors.rotation_rad)),
         "posed_share": mean(np.isfinite(errors.mssd_m)),
+        **named_accuracies("pose", errors.translation_m, errors.rotation_rad),
+        "add_auc": area_under_curve(errors.add_m),
+        "adds_auc": area_under_curve(errors.adds_m),
+        **recalls,
+        "bop_recall": None if None in recalls.values() else float(np.mean([*recalls.values()])),
     }
+
+
+def accuracy(translation_m: Array, rotation_rad: Array, within_m: Array, within_rad: Array) -> Array:
+    """The paper's accuracy (section V-B): the share N_correct / N_total within both thresholds.
+
+    Errors (n,) each, and thresholds that broadcast against each other (...) -> (...); NaN where there are no errors.
+    """
+    within_m, within_rad = np.broadcast_arrays(within_m, within_rad)
+    if len(translation_m) == 0:
+        return np.full(within_m.shape, np.nan)
+    near = translation_m <= within_m[..., None]
+    return (near & (rotation_rad <= within_rad[..., None])).mean(axis=-1)
+
+
+def named_accuracies(name: str, translation_m: Array, rotation_rad: Array) -> dict[str, float | None]:
+    """`accuracy` at THRESHOLDS, as <name>_2cm_10deg and so on."""
+    return {
+        f"{name}_{point}": mean((translation_m <= metres) & (rotation_rad <= rad))
+        for point, (metres, rad) in THRESHOLDS.items()
+    }
+
+
+def area_under_curve(errors_m: Array) -> float | None:
+    """The area under accuracy over threshold from 0 to AUC_M, as a share of the largest: errors (n,) -> 0 to 1.
+
+    The accuracy is a staircase, and this its exact integral.
+    """
+    return mean(np.maximum(0.0, 1.0 - errors_m / AUC_M))
 
 
 def class_metrics(errors: FrameErrors) -> dict[str, float | None]:

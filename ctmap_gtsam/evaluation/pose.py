@@ -1,11 +1,11 @@
-"""How wrong a pose is: translation, rotation, MSSD, ADD and ADD-S, each the best over the object's symmetries.
+"""How wrong a pose is: translation, rotation, MSSD, MSPD, ADD and ADD-S, all but ADD the best over symmetries.
 
 Every function takes batches of two poses of one object in one frame of reference, here the camera's, and gives one
-number a pair: metres or radians. With a symmetry S of the class, ``T_true S`` is as true as ``T_true``.
+number a pair: metres, radians or pixels. With a symmetry S of the class, ``T_true S`` is as true as ``T_true``.
 
-Sources: Hodan et al., BOP Challenge 2020 on 6D Object Localization (ECCV Workshops 2020), for MSSD and for turning
-continuous symmetries into steps; Hinterstoisser et al., Model Based Training, Detection and Pose Estimation (ACCV
-2012), for ADD and ADD-S (there for objects with indistinguishable views; ADI in BOP).
+Sources: Hodan et al., BOP Challenge 2020 on 6D Object Localization (ECCV Workshops 2020), for MSSD, MSPD and for
+turning continuous symmetries into steps; Hinterstoisser et al., Model Based Training, Detection and Pose Estimation
+(ACCV 2012), for ADD and ADD-S (there for objects with indistinguishable views; ADI in BOP).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from sequences import se3
+from sequences.camera import Camera
 from sequences.catalogue import ContinuousSymmetry, ObjectClass
 
 Array = NDArray[np.float64]
@@ -57,6 +58,11 @@ class Shape:
             return vertices[np.sort(ConvexHull(vertices).vertices)]
         except (QhullError, ValueError):  # flat, or too few points
             return vertices
+
+    @cached_property
+    def vertices(self) -> Array:
+        """(V, 3) all vertices, those of the hull first: a maximum over them is then soon nearly known."""
+        return np.concatenate([self.extreme_points, self.of.mesh.vertices])
 
     @cached_property
     def sample(self) -> Array:
@@ -148,6 +154,18 @@ def mssd(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
     return _nearest_twin(shape, T_estimated, T_true)[0]
 
 
+def mspd(shape: Shape, T_estimated: Array, T_true: Array, camera: Camera) -> Array:
+    """Maximum Symmetry-Aware Projection Distance of BOP: min over symmetries of max over vertices, in the image.
+
+    Poses (..., 4, 4) in the camera -> (...) pixels: ``min_S max_x |project(T_estimated x) - project(T_true S x)|``.
+    Vertices that are truly behind the camera don't count; where the estimate puts another one there, it is infinite.
+    """
+    batch = T_estimated.shape[:-2]
+    ours = np.ascontiguousarray(T_estimated.reshape(-1, 4, 4))
+    true = np.ascontiguousarray((T_true[..., None, :, :] @ shape.symmetries).reshape(-1, len(shape.symmetries), 4, 4))
+    return _least_projection(ours, true, np.ascontiguousarray(shape.vertices), camera.fx, camera.fy).reshape(batch)
+
+
 def add(shape: Shape, T_estimated: Array, T_true: Array) -> Array:
     """Average Distance of model points: poses (..., 4, 4) -> (...) metres, mean over vertices, no symmetry."""
     vertices = shape.of.mesh.vertices
@@ -199,3 +217,41 @@ def _least_maximum(maps, points):
                 least, index[n] = largest, s
         out[n] = np.sqrt(least)
     return out, index
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _least_projection(ours, true, points, fx, fy):
+    """Poses (N, 4, 4) and (N, S, 4, 4), points (V, 3) -> (N,) min over S of max over V of the distance of the images.
+
+    The principal point is the same in both images, so it doesn't matter.
+    """
+    out = np.full(ours.shape[0], np.inf)
+    image = np.empty((points.shape[0], 2))
+    for n in range(ours.shape[0]):
+        for v in range(points.shape[0]):
+            image[v, 0], image[v, 1] = _projection(ours[n], points[v], fx, fy)
+        least = np.inf
+        for s in range(true.shape[1]):
+            largest = 0.0
+            for v in range(points.shape[0]):
+                x, y = _projection(true[n, s], points[v], fx, fy)
+                if np.isfinite(x):
+                    square = (image[v, 0] - x) ** 2 + (image[v, 1] - y) ** 2
+                    largest = max(largest, square if np.isfinite(square) else np.inf)
+                if largest >= least:
+                    break
+            least = min(least, largest)
+        out[n] = np.sqrt(least)
+    return out
+
+
+@numba.njit(inline="always")
+def _projection(T, point, fx, fy):
+    """Infinite behind the camera."""
+    x, y, z = point[0], point[1], point[2]
+    depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if depth <= 0.0:
+        return np.inf, np.inf
+    u = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    v = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    return fx * u / depth, fy * v / depth

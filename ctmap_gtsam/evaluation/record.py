@@ -17,17 +17,25 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.evaluation import frames
+from ctmap_gtsam.evaluation import calibration, frames, moves, trajectory, visits
 from ctmap_gtsam.evaluation.boxes import JudgedBoxes, TrueBoxes, judge_boxes, mean_average_precision, true_boxes
+from ctmap_gtsam.evaluation.calibration import ExistenceSamples, PoseSamples
 from ctmap_gtsam.evaluation.detection import best_classes, score_detections
 from ctmap_gtsam.evaluation.frames import FrameErrors
+from ctmap_gtsam.evaluation.identity import identity_switches
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, from_estimate, from_truth, match, shapes_of
+from ctmap_gtsam.evaluation.moves import Periods
+from ctmap_gtsam.evaluation.trajectory import CameraErrors
 from ctmap_gtsam.evaluation.views import final_views, views
+from ctmap_gtsam.evaluation.visits import LastSeen, MapEnds
 from sequences.atomic import write_npz
 from sequences.errors import InputError
 from sequences.types import Run, Truth
+
+Array = NDArray[np.float64]
 
 SCHEMA = 1
 
@@ -40,13 +48,24 @@ COUNTS = (
     "existing_objects_final",
     "hypotheses_scored",
     "false_positive_boxes",
+    "identity_switches",
 )
 """True objects, visible somewhere, that nothing matches; estimated objects, existing somewhere, that match nothing;
 objects in the map of the last keyframe; poses that the method rendered and scored; the detector's boxes that belong to
-no visible true object"""
+no visible true object; see `identity`"""
 
-METRICS = ("map_50", "map_50_paper", *frames.CLASSES, *frames.POSES, *COUNTS)
-"""What `pooled` gives"""
+_POSED = (
+    *frames.POSES,
+    *visits.LAST_SEEN,
+    *visits.MAPS,
+    *trajectory.TRAJECTORY,
+    *moves.MOVES,
+    *calibration.POSE_CALIBRATION,
+    *calibration.EXISTENCE,
+)
+METRICS = ("map_50", "map_50_paper", *frames.CLASSES, *_POSED, *COUNTS)
+"""What `pooled` gives. map_50: mean average precision at IoU 0.5 of each frame's own estimate; map_50_paper: of the map
+at the end of each visit in all of its frames, and of the detector's boxes as they are"""
 
 DRAWN_PX = 320
 """Maps are drawn at most about this wide for their boxes, which are then good to two pixels of a VGA image"""
@@ -72,6 +91,12 @@ class Record:
     """of each frame's own estimate"""
     final_boxes: JudgedBoxes
     """of the map at the end of each frame's visit: the paper's protocol"""
+    last_seen: LastSeen
+    maps: MapEnds
+    cameras: CameraErrors
+    periods: Periods
+    pose_samples: PoseSamples
+    existence: ExistenceSamples
 
     def save(self, path: Path) -> None:
         """Write one .npz without pickle, whole or not at all; equal records give equal bytes."""
@@ -105,6 +130,12 @@ _TABLES: tuple[tuple[str, type[Any]], ...] = (
     ("frames", FrameErrors),
     ("boxes", JudgedBoxes),
     ("final_boxes", JudgedBoxes),
+    ("last_seen", LastSeen),
+    ("maps", MapEnds),
+    ("cameras", CameraErrors),
+    ("periods", Periods),
+    ("pose_samples", PoseSamples),
+    ("existence", ExistenceSamples),
 )
 
 
@@ -135,7 +166,8 @@ class Judge:
     def estimate(self, method: MethodMap) -> Judgement:
         """Judge a method that has poses."""
         matching = match(self.objects, method.objects, self.shapes)
-        errors = frames.frame_errors(method, self.objects, matching, self.shapes)
+        case = self.run, method, self.objects, matching
+        errors = frames.frame_errors(*case, self.shapes, self._step)
         obj_ids = self.run.catalogue.obj_ids
         own = [view.boxes() for view in views(self.run, method.estimate, self._step)]
         final = [view.boxes() for view in final_views(self.run, method.estimate, self._step)]
@@ -145,11 +177,18 @@ class Judge:
             counts={
                 "missed_objects": int(((matching.row < 0) & self.objects.visible.any(axis=1)).sum()),
                 "false_positive_objects": len(matching.unmatched),
+                "identity_switches": identity_switches(self.objects, method.objects, self.shapes),
                 **own_counts(method.estimate),
             },
             errors=errors,
             boxes=judge_boxes(self.boxes, own, obj_ids),
             final_boxes=judge_boxes(self.boxes, final, obj_ids),
+            last_seen=visits.last_seen(*case, self.shapes),
+            maps=visits.map_ends(*case, self.shapes),
+            cameras=trajectory.camera_errors(self.run, method.T_world_camera, self.truth.T_world_camera),
+            periods=moves.periods(self.run, method, self.truth, self.objects, matching, self.shapes),
+            pose_samples=calibration.pose_samples(self.run, method, self.truth, self.objects, matching),
+            existence=calibration.existence_samples(*case),
         )
         return Judgement(record, errors, matching)
 
@@ -165,6 +204,7 @@ class Judge:
             errors=errors,
             boxes=boxes,
             final_boxes=boxes,  # the paper judges its detector frame by frame, too
+            **{table: _empty(kind) for table, kind in _TABLES if table not in ("frames", "boxes", "final_boxes")},
         )
         return Judgement(record, errors, None)
 
@@ -207,10 +247,35 @@ def pooled(records: Sequence[Record]) -> dict[str, float | None]:
     metrics |= frames.class_metrics(at_frames)
     if all(r.posed for r in records):
         metrics |= frames.pose_metrics(at_frames)
+        metrics |= visits.last_seen_metrics(_together([r.last_seen for r in records]))
+        metrics |= visits.map_metrics(_together([r.maps for r in records]))
+        metrics |= trajectory.trajectory_metrics(_together([r.cameras for r in records]))
+        metrics |= moves.move_metrics(_together([r.periods for r in records]))
+        metrics |= calibration.pose_calibration_metrics(_together([r.pose_samples for r in records]))
+        metrics |= calibration.existence_metrics(_together([r.existence for r in records]))
     for name in COUNTS:
         known = [r.counts[name] for r in records if name in r.counts]
         metrics[name] = sum(known) if len(known) == len(records) else None
     return metrics
+
+
+def pose_curve(records: Sequence[Record], within_m: Array, within_rad: Array, *, last_seen: bool = False) -> Array:
+    """Pose accuracy over thresholds, of one method over several runs: the paper's pose figure.
+
+    Args:
+        records: of a method with poses.
+        within_m: thresholds of the translation error.
+        within_rad: of the rotation error; broadcasts against `within_m` (...).
+        last_seen: of the maps at the ends of the visits, at the frames in which objects are last seen (the paper's
+            protocol), instead of each frame's own estimate.
+
+    Returns:
+        (...) share of the object-frames or object-visits within both; NaN where there are none.
+    """
+    errors = [r.last_seen if last_seen else r.frames for r in records]
+    shift = np.concatenate([e.translation_m for e in errors])
+    turn = np.concatenate([e.rotation_rad for e in errors])
+    return frames.accuracy(shift, turn, np.asarray(within_m), np.asarray(within_rad))
 
 
 def own_counts(estimate: Estimate) -> dict[str, int]:
@@ -227,6 +292,10 @@ def _together(tables: Sequence[Table]) -> Table:
     """Rows of tables of one kind, one after the other."""
     kind = type(tables[0])
     return kind(**{f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(kind)})  # type: ignore[arg-type]
+
+
+def _empty(kind: type[Any]) -> Any:
+    return kind(**{f.name: np.zeros(0) for f in fields(kind)})
 
 
 def _boxes(tables: Sequence[JudgedBoxes], records: Sequence[Record], names: Sequence[str]) -> JudgedBoxes:

@@ -49,15 +49,15 @@ def silhouettes(
     With a step, every `step`-th pixel each way stands for its neighbours: boxes are then good to `step` pixels.
     """
     coarse = camera.window(0, 0, -(-camera.width // step), -(-camera.height // step), step)
-    drawn = [_draw(catalogue[int(c)].mesh, T, coarse) for c, T in zip(class_id, T_camera_object, strict=True)]
+    drawn = [draw(catalogue[int(c)].mesh, T, coarse) for c, T in zip(class_id, T_camera_object, strict=True)]
     nearest = np.full((coarse.height, coarse.width), np.inf, dtype=np.float32)
     for window, depth in drawn:
         np.minimum(nearest[window], depth, out=nearest[window])
     return [_silhouette(window, depth, nearest, camera, step) for window, depth in drawn]
 
 
-def _draw(mesh: Mesh, T: Array, camera: Camera) -> tuple[Window, NDArray[np.float32]]:
-    """The window (rows, columns) that the mesh may cover, and its depth there, infinite where nothing is."""
+def draw(mesh: Mesh, T: Array, camera: Camera) -> tuple[Window, NDArray[np.float32]]:
+    """The window (rows, columns) that a mesh at T_camera_object may cover, and its depth there, infinite elsewhere."""
     x, y, width, height = _window(mesh, T, camera)
     rows, columns = slice(y, y + height), slice(x, x + width)
     if not width or not height:
