@@ -22,8 +22,19 @@ if TYPE_CHECKING:
     from ctmap_gtsam.smoothing.smoother import smooth_run
     from sequences.bop import load_run
     from sequences.errors import InputError
+    from sequences.truth import load_truth
 
-__all__ = ["Config", "Estimate", "InputError", "compare", "filter_run", "load_config", "load_run", "smooth_run"]
+__all__ = [
+    "Config",
+    "Estimate",
+    "InputError",
+    "compare",
+    "filter_run",
+    "load_config",
+    "load_run",
+    "load_truth",
+    "smooth_run",
+]
 
 _HOMES = {
     "Config": "ctmap_gtsam.config",
@@ -33,6 +44,7 @@ _HOMES = {
     "filter_run": "ctmap_gtsam.filtering.filter",
     "load_config": "ctmap_gtsam.config",
     "load_run": "sequences.bop",
+    "load_truth": "sequences.truth",
     "smooth_run": "ctmap_gtsam.smoothing.smoother",
 }
 

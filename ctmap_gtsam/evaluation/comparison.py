@@ -68,6 +68,17 @@ class Comparison:
     agreement: Mapping[str, Agreement]
     """each other method with poses held to the reference method"""
 
+    def row(self, method: str, label: str) -> int | None:
+        """The row of a method's estimate for a true object of `labels`; None where nothing matches it.
+
+        Raises KeyError for a method that isn't there or has no poses, and for an unknown label.
+        """
+        matching = self.methods[method].matching
+        if matching is None or label not in self.labels:
+            raise KeyError(label if matching is not None else method)
+        row = int(matching.row[self.labels.index(label)])
+        return row if row >= 0 else None
+
     def table(self) -> pd.DataFrame:
         """One row a method, one column a metric."""
         flat = {name: {k: v for k, v in s.metrics.items() if k != "objects"} for name, s in self.methods.items()}
