@@ -51,24 +51,24 @@ def shampoo_bottle() -> Mesh:
 
 
 def loofah() -> Mesh:
-    """A puff of mesh cloth of 146 x 138 x 66 mm: as wide and high as the bowl, but a heap where that is hollow."""
+    """A puff of mesh cloth of 152 x 146 x 83 mm: much of the bowl's outline, but a heap where that is hollow."""
 
     def ruffles(d: Array) -> Array:
         turn = np.arctan2(d[:, 1], d[:, 0])
         rings = np.sin(9.0 * turn + 7.0 * d[:, 2]) * np.sin(11.0 * np.arcsin(np.clip(d[:, 2], -1.0, 1.0)) + 2.0 * turn)
         return 1.0 + 0.055 * rings * np.sqrt(1.0 - d[:, 2] ** 2 + 1e-9) + 0.02 * np.sin(3.0 * turn + 1.0)
 
-    vertices, faces = puff((0.146, 0.136, 0.074), ruffles, rings=19, segments=36)
-    flat = np.maximum(vertices, [-1.0, -1.0, -0.03])  # it lies on its own weight
+    vertices, faces = puff((0.146, 0.142, 0.096), ruffles, rings=19, segments=36)
+    flat = np.maximum(vertices, [-1.0, -1.0, -0.034])  # it lies on its own weight
     pink, pale = np.array((232, 112, 148)), np.array((250, 196, 210))
 
     def paint(v: Array) -> Array:
-        reach = np.linalg.norm(v / (0.073, 0.068, 0.037), axis=-1)
+        reach = np.linalg.norm(v / (0.073, 0.071, 0.048), axis=-1)
         share = np.clip((reach - 0.93) / 0.14, 0.0, 1.0)[:, None]
         return (1.0 - share) * pink + share * pale
 
     s = np.radians(np.linspace(20.0, 340.0, 13))
-    cord = np.stack([0.06 - 0.018 * np.cos(s), 0.016 * np.sin(s), -0.023 + 0.0 * s], axis=-1)
+    cord = np.stack([0.06 - 0.018 * np.cos(s), 0.016 * np.sin(s), -0.028 + 0.0 * s], axis=-1)
     white = (240, 238, 236)
     return assemble([((flat, faces), paint), (tube(cord, 0.0022, 8), plain(white))])
 

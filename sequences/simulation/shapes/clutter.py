@@ -137,10 +137,10 @@ def cable() -> Mesh:
     s = np.linspace(0.0, 1.0, 72)
     turn = 5.2 * np.pi * s
     reach = 0.052 + 0.022 * np.sin(1.7 * turn) + 0.02 * s
-    path = np.stack(
-        [reach * np.cos(turn) + 0.05 * s, 0.8 * reach * np.sin(turn), 0.0035 + 0.0028 * (s * 5.2 // 1)], axis=-1
-    )
-    plug = moved(rounded_box((0.05, 0.034, 0.028), 0.006), path[-1] + [0.0, 0.0, 0.002], rotation("z", 40.0))
+    high = 0.0027 + 0.009 * np.clip(s - 0.4, 0.0, 1.0)  # the first loop lies on the ground, the next ones on it
+    path = np.stack([reach * np.cos(turn) + 0.05 * s, 0.8 * reach * np.sin(turn), high], axis=-1)
+    end = path[-1] * (1.0, 1.0, 0.0) + (0.0, 0.0, 0.0141)
+    plug = moved(rounded_box((0.05, 0.034, 0.028), 0.006), end, rotation("z", 40.0))
     return assemble([(tube(path, 0.0027, 8), plain((36, 36, 38))), (plug, plain((44, 44, 46)))])
 
 
@@ -228,8 +228,8 @@ def photo_frame() -> Mesh:
         (within(x=(-0.055, 0.055), y=(-1.0, 0.0), z=(-0.08, 0.03)), (112, 142, 108)),
         (within(x=(-0.055, 0.055), y=(-1.0, 0.0), z=(-0.08, -0.01)), (196, 178, 132)),
     )
-    stand = np.array([[0.0, 0.012, 0.15], [0.0, 0.04, 0.075], [0.0, 0.07, 0.004]])
-    leaning = moved(board, (0.0, 0.0, 0.098), lean)
+    leaning = moved(board, (0.0, 0.0, -float((board[0] @ lean.T)[:, 2].min())), lean)
+    stand = np.array([[0.0, 0.03, 0.15], [0.0, 0.055, 0.075], [0.0, 0.08, 0.01], [0.0, 0.08, 0.0]])
     return assemble([(leaning, baked(paint, board)), (tube(stand, 0.006, 8), plain((60, 46, 38)))])
 
 
@@ -242,7 +242,7 @@ def tissue_box() -> Mesh:
         turn = np.arctan2(d[:, 1], d[:, 0])
         return 1.0 + 0.22 * np.sin(3.0 * turn + 4.0 * d[:, 2]) + 0.1 * np.sin(7.0 * turn)
 
-    tissue = moved(puff((0.09, 0.045, 0.13), crease, 10, 20), (0.0, 0.0, 0.03))
+    tissue = moved(puff((0.09, 0.045, 0.13), crease, 10, 20), (0.0, 0.0, 0.046))
     return assemble([(box, paint), (tissue, plain((246, 246, 244)))])
 
 

@@ -9,11 +9,16 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from sequences import se3
-from sequences.simulation.shapes import Shape, catalogue, household
+from sequences.camera import Camera
+from sequences.rendering.scene import render_scene
+from sequences.simulation.shapes import Body, Shape, catalogue, clothed, clutter, household
+from sequences.simulation.solids import rotation
 from tests.sequences.simulation.solid_geometry import distances, winding_numbers
 
 SHAPES = household()
 TURNED = [s for s in SHAPES if s.object_class.symmetries_continuous]
+NAMED = {s.object_class.name: s for s in SHAPES}
+CLUTTER = clutter()
 every_shape = pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.object_class.name)
 
 
@@ -98,17 +103,20 @@ def test_no_symmetry_is_left_out(shape):
             assert moved_by(shape, se3.make(R, np.zeros(3))) > 1e-3
 
 
+def least_margin(body: Body, R: np.ndarray) -> float:
+    """How far within the outline of what touches the ground the middle of mass lies, metres."""
+    solid = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False)
+    points = body.mesh.vertices @ R.T
+    touching = points[points[:, 2] < points[:, 2].min() + 1.5e-3][:, :2]
+    hull = ConvexHull(touching)
+    return float(-(hull.equations[:, :2] @ (R @ solid.center_mass)[:2] + hull.equations[:, 2]).max())
+
+
 @every_shape
 def test_things_stand_stably_in_each_rest(shape):
-    mesh = shape.object_class.mesh
-    centre = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).center_mass
     for R in shape.rests:
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        points = mesh.vertices @ R.T
-        touching = points[points[:, 2] < points[:, 2].min() + 1.5e-3][:, :2]
-        hull = ConvexHull(touching)
-        margin = -(hull.equations[:, :2] @ (R @ centre)[:2] + hull.equations[:, 2]).max()
-        assert margin > 1e-3
+        assert least_margin(shape, R) > 1e-3
 
 
 @every_shape
@@ -123,6 +131,82 @@ def test_support_areas_lie_on_the_furniture_and_are_free_above(shape):
         for height in (0.01, 0.5 * area.headroom_m, 0.98 * area.headroom_m):
             above = area.centre + grid + [0.0, 0.0, height]
             assert np.abs(winding_numbers(above, mesh.vertices, mesh.faces)).max() < 0.5
+
+
+def seen_from(name: str, down: float, yaw: float) -> np.ndarray:
+    """(h, w) depth of a thing standing on the ground a metre off, metres; 0 where it isn't."""
+    mesh = NAMED[name].object_class.mesh
+    stand = se3.make(rotation("z", yaw), np.array([0.0, 0.0, -mesh.vertices[:, 2].min()]))
+    R = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ rotation("x", -down)
+    look = se3.make(R, np.array([0.0, 0.0, 0.03]) - R[:, 2])
+    camera = Camera(570.0, 570.0, 159.5, 119.5, 320, 240)
+    return render_scene([(mesh, se3.inverse(look) @ stand)], camera).depth.astype(float)
+
+
+@pytest.mark.parametrize("down", [20.0, 35.0, 50.0])
+@pytest.mark.parametrize("yaw", [0.0, 35.0])
+def test_depth_can_hardly_tell_the_shampoo_from_the_milk(down, yaw):
+    one, other = seen_from("milk_carton", down, yaw), seen_from("shampoo_bottle", down, yaw)
+    both = (one > 0) & (other > 0)
+    assert both.sum() > 0.92 * ((one > 0) | (other > 0)).sum()
+    assert np.median(np.abs(one - other)[both]) < 0.0016  # the sensor's noise at 1 m
+    assert NAMED["milk_carton"].object_class.category != NAMED["shampoo_bottle"].object_class.category
+
+
+@pytest.mark.parametrize("down", [20.0, 35.0, 50.0])
+def test_the_loofah_fills_the_bowls_outline_but_depth_tells_them_apart(down):
+    bowl, loofah = seen_from("bowl", down, 0.0), seen_from("loofah", down, 35.0)
+    both = (bowl > 0) & (loofah > 0)
+    assert both.sum() > 0.7 * ((bowl > 0) | (loofah > 0)).sum()
+    assert np.median(np.abs(bowl - loofah)[both]) > 0.02
+    assert NAMED["bowl"].object_class.category != NAMED["loofah"].object_class.category
+
+
+def test_glossy_is_between_dull_and_a_mirror():
+    assert all(0.0 <= body.gloss <= 1.0 for body in (*SHAPES, *CLUTTER))
+    assert NAMED["soup_can"].gloss > NAMED["cereal_box"].gloss > NAMED["sponge"].gloss == 0.0
+
+
+@pytest.mark.parametrize("thing", CLUTTER, ids=lambda c: c.name)
+def test_clutter_is_solid_stands_stably_and_has_no_class(thing):
+    assert 0.05 < np.ptp(thing.mesh.vertices, axis=0).max() < 0.5
+    assert thing.mesh.is_solid
+    assert len(thing.mesh.faces) <= 3000
+    assert all(least_margin(thing, R) > 1e-3 for R in thing.rests)
+    assert thing.name not in NAMED
+
+
+@pytest.mark.parametrize("name", ["table", "desk", "side_table"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cloth_changes_what_is_seen_but_not_what_is_known(name, seed):
+    plain, covered = NAMED[name], clothed(NAMED[name], np.random.default_rng(seed))
+    assert covered.object_class is plain.object_class
+    assert plain.mesh is plain.object_class.mesh
+    assert covered.mesh is covered.appearance
+    assert covered.mesh.is_solid
+    # a shell round the top: little wider, hardly higher, and it leaves the feet free
+    wider = np.ptp(covered.mesh.vertices, axis=0) - np.ptp(plain.mesh.vertices, axis=0)
+    assert (wider > 0).all()
+    assert (wider[:2] < 0.2).all()
+    assert wider[2] < 0.002
+    cloth = covered.mesh.vertices[len(plain.mesh.vertices) :]
+    assert cloth[:, 2].min() > plain.mesh.vertices[:, 2].min() + 0.05
+    (area,), (below,) = covered.areas, plain.areas
+    np.testing.assert_array_equal(area.size, below.size)
+    corners = area.centre + 0.47 * np.array([[i, j, 0.0] for i in (-1, 0, 1) for j in (-1, 0, 1)]) * [*area.size, 0.0]
+    assert distances(corners, covered.mesh.vertices, covered.mesh.faces).max() < 1e-6
+    inside = winding_numbers(plain.mesh.vertices[::7] * 0.999, covered.mesh.vertices, covered.mesh.faces)
+    assert inside.min() > -0.5  # nothing is turned inside out
+
+
+@pytest.mark.parametrize("name", ["table", "desk", "side_table"])
+def test_nothing_of_the_top_shows_through_its_cloth(name):
+    covered = clothed(NAMED[name], np.random.default_rng(0))
+    above = np.array([0.0, 0.0, 1.5])
+    look = se3.make(np.diag([1.0, -1.0, -1.0]), covered.areas[0].centre + above)
+    camera = Camera(150.0, 150.0, 119.5, 79.5, 240, 160)
+    face = render_scene([(covered.mesh, se3.inverse(look))], camera).face
+    assert (face[face >= 0] >= len(covered.object_class.mesh.faces)).all()
 
 
 def test_the_measures_of_distance_and_inside_are_right():
