@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from sequences.atomic import write_json, write_text
 from sequences.bop import load_run
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
+from sequences.truth import truth_fingerprint
 from sequences.types import Run
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def run_methods(
     progress: Progress = SILENT,
     registry: Mapping[str, Method] | None = None,
 ) -> dict[str, Outcome]:
-    """Run methods one after another, in the order of the registry.
+    """Run methods one after another, in the order of the registry; what they build on runs before them, once.
 
     Args:
         run: the recording.
@@ -105,11 +106,12 @@ def run_methods(
         raise InputError(
             f"there is no method {', '.join(unknown)}", field="--methods", remedy=f"choose of {', '.join(registry)}"
         )
-    chosen = [method for name, method in registry.items() if methods is None or name in methods]
-    outcomes = {}
+    chosen = list(registry) if methods is None else [name for name in registry if name in methods]
+    session = _Session(run, config, registry, store, progress)
+    outcomes: dict[str, Outcome] = {}
     with progress.stage("methods", total=len(chosen)) as stage:
-        for method in chosen:
-            outcomes[method.name] = _run_method(run, method, config, store, progress)
+        for name in chosen:
+            outcomes[name] = session.outcome(name)
             stage.advance()
     return outcomes
 
@@ -141,7 +143,7 @@ def summarise(
     """The content of summary.json but for `files`: numbers, or null where there is none."""
     methods: dict[str, Any] = {}
     for name, outcome in outcomes.items():
-        told = {"status": outcome.status, "seconds": outcome.seconds}
+        told = {"status": outcome.status, "seconds": outcome.seconds, "reads_truth": outcome.reads_truth}
         if outcome.status == "skipped":
             methods[name] = {**told, "metrics": {}, "reason": outcome.reason, "remedy": outcome.remedy}
         else:
@@ -194,23 +196,56 @@ class _Stored:
         write_json(self.about, {"seconds": seconds, "sha256": digest, **self.key})
 
 
-def _run_method(run: Run, method: Method, config: Config, store: Path | None, progress: Progress) -> Outcome:
-    obstacle = method.skip(run)
-    if obstacle is not None:
-        return Outcome("skipped", reason=obstacle)
-    if method.kind == "detections":
-        return Outcome("ok", 0.0)
-    key = {"method": method.name, "config": to_dict(config), "fingerprint": run.fingerprint, "code": code().estimating}
-    stored = _Stored(store, method.name, json.loads(json.dumps(key))) if store is not None else None
-    if stored is not None and (found := stored.load()) is not None:
-        return found
-    assert method.run is not None
-    start = time.perf_counter()
-    estimate = method.run(run, config, progress)
-    seconds = time.perf_counter() - start
-    if stored is not None:
-        stored.save(estimate, seconds)
-    return Outcome("ok", seconds, estimate)
+@dataclass(frozen=True)
+class _Session:
+    """Methods that run on one run with the same settings, each once."""
+
+    run: Run
+    config: Config
+    registry: Mapping[str, Method]
+    store: Path | None
+    progress: Progress
+    _outcomes: dict[str, Outcome] = field(default_factory=dict)
+
+    def outcome(self, name: str) -> Outcome:
+        """What becomes of a method, after what becomes of those that it builds on."""
+        if name not in self._outcomes:
+            method = self.registry[name]
+            self._outcomes[name] = replace(self._run(method), reads_truth=method.reads_truth)
+        return self._outcomes[name]
+
+    def _run(self, method: Method) -> Outcome:
+        obstacle = method.skip(self.run)
+        if obstacle is not None:
+            return Outcome("skipped", reason=obstacle)
+        if method.kind == "detections":
+            return Outcome("ok", 0.0)
+        stored = self._stored(method)
+        if stored is not None and (found := stored.load()) is not None:
+            return found
+        assert method.run is not None
+        needed = [self.outcome(name) for name in method.needs]
+        start = time.perf_counter()
+        estimate = method.run(self.run, self.config, self.progress, *(one.estimate for one in needed))
+        # what it takes alone
+        seconds = time.perf_counter() - start + sum(one.seconds or 0.0 for one in needed)
+        if stored is not None:
+            stored.save(estimate, seconds)
+        return Outcome("ok", seconds, estimate)
+
+    def _stored(self, method: Method) -> _Stored | None:
+        """Where its estimate would lie, and all that it is made from."""
+        if self.store is None:
+            return None
+        key = {
+            "method": method.name,
+            "config": to_dict(self.config),
+            "fingerprint": self.run.fingerprint,
+            "code": code().estimating,
+        }
+        if method.reads_truth:
+            key["truth"] = truth_fingerprint(self.run)
+        return _Stored(self.store, method.name, json.loads(json.dumps(key)))
 
 
 def _estimates(outcomes: Mapping[str, Outcome]) -> dict[str, Estimate]:
@@ -275,6 +310,6 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 def _outcome(out: Path, name: str, told: Mapping[str, Any]) -> Outcome:
     if told["status"] == "skipped":
-        return Outcome("skipped", reason=told["reason"], remedy=told["remedy"])
+        return Outcome("skipped", reason=told["reason"], remedy=told["remedy"], reads_truth=told.get("reads_truth", False))
     estimate = None if name == DETECTOR else Estimate.load(out / ESTIMATES / f"{name}.npz")
-    return Outcome("ok", told["seconds"], estimate)
+    return Outcome("ok", told["seconds"], estimate, reads_truth=told.get("reads_truth", False))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ctmap_gtsam.parameters import (
+    Baselines,
     Context,
     Detector,
     Filter,
@@ -34,6 +35,7 @@ class Config:
     frontend: Frontend = field(default_factory=Frontend)
     filter: Filter = field(default_factory=Filter)
     smoother: Smoother = field(default_factory=Smoother)
+    baselines: Baselines = field(default_factory=Baselines)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
 
     def __post_init__(self) -> None:

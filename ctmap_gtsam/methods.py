@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
+from ctmap_gtsam.baselines import oracle, registration
+from ctmap_gtsam.baselines.copying import copy_back
+from ctmap_gtsam.baselines.detected import register_detections
+from ctmap_gtsam.baselines.fusion import static_fusion
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
@@ -14,7 +18,8 @@ from ctmap_gtsam.smoothing.smoother import smooth_run
 from sequences.progress import Progress
 from sequences.types import Run
 
-Runner = Callable[[Run, Config, Progress], Estimate]
+Runner = Callable[..., Estimate]
+"""(run, config, progress, *estimates of what it needs) -> its own"""
 
 
 @dataclass(frozen=True)
@@ -28,12 +33,24 @@ class Method:
     run: Runner | None
     skip: Callable[[Run], str | None]
     """why the method can't run on a run, with the remedy; None where it can"""
+    needs: tuple[str, ...] = ()
+    """methods on whose estimates it builds, and which can run wherever it can; `comparing.run_methods` runs them"""
+    reads_truth: bool = False
+    """it answers from what nobody knows outside a benchmark, and is shown as such"""
 
 
 def _needs_detections(run: Run) -> str | None:
     if any(frame.detections for frame in run.frames):
         return None
     return "the run has no detections; add scene_detections.json to its scenes"
+
+
+def _needs_open3d(run: Run) -> str | None:
+    return _needs_detections(run) or registration.obstacle()
+
+
+def _needs_truth(run: Run) -> str | None:
+    return oracle.obstacle(run) or registration.obstacle()
 
 
 def _filter(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
@@ -48,10 +65,22 @@ METHODS: dict[str, Method] = {
     m.name: m
     for m in (
         Method("detector", "the detector's boxes as they are", "detections", None, _needs_detections),
+        Method("icp", "ICP in each keyframe's detected boxes", "estimate",
+               partial(register_detections, kind="icp"), _needs_open3d),
+        Method("fpfh", "FPFH and RANSAC in each keyframe's detected boxes", "estimate",
+               partial(register_detections, kind="fpfh"), _needs_open3d),
+        Method("icp-oracle", "ICP in true boxes of the true class, where each object is last seen: reads the truth",
+               "estimate", partial(oracle.register_truth, kind="icp"), _needs_truth, reads_truth=True),
+        Method("fpfh-oracle", "FPFH and RANSAC in the same: reads the truth",
+               "estimate", partial(oracle.register_truth, kind="fpfh"), _needs_truth, reads_truth=True),
+        Method("static-fusion", "one pose an object and visit, fused from all keyframes: nothing moves, no context",
+               "estimate", static_fusion, _needs_detections),
         Method("filter-t", "T-Map: the particle filter without context", "estimate",
                partial(_filter, context=False), _needs_detections),
         Method("filter-ct", "CT-Map: the particle filter, each frame seeing the past", "estimate",
                partial(_filter, context=True), _needs_detections),
+        Method("last-copied-back", "filter-ct's last map of each visit in all of the visit's frames", "estimate",
+               copy_back, _needs_detections, needs=("filter-ct",)),
         Method("smooth-t", "the factor-graph smoother without context", "estimate",
                partial(_smooth, context=False), _needs_detections),
         Method("smooth-ct", "the factor-graph smoother, each frame seeing the whole run", "estimate",

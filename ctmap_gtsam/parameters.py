@@ -118,3 +118,23 @@ class Smoother:
         0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
     )
     bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """What the estimators are held to: registration of single frames by ICP and FPFH, and static fusion."""
+
+    iterations: int = option(50000, "of ICP, and of FPFH's RANSAC, at most (the paper's)", low=1)
+    crop_diameters: float = option(
+        0.5, "a box's points further from its middle's depth than so many diameters are left out; 0 = none", low=0.0
+    )
+    voxel: float = option(0.05, "clouds keep a point a voxel of this share of the class's diameter ...", low=1e-3)
+    min_voxel_m: float = option(0.003, "... but of this size at least, metres", low=1e-4)
+    min_points: int = option(20, "a crop of fewer points is not registered", low=4)
+    mesh_points: int = option(20000, "points drawn on a class's mesh, before they are thinned", low=100)
+    icp_starts: int = option(4, "random orientations that ICP starts from; the best fit counts", low=1)
+    icp_distance: float = option(0.3, "ICP pairs points up to this share of the diameter apart", low=1e-3)
+    fpfh_refine: bool = option(False, "ICP after FPFH's global registration, of which the paper says nothing")
+    fusion_search_share: float = option(
+        0.25, "effort of static fusion's search in each keyframe, as a share of the configured one", low=0.01
+    )

@@ -5,6 +5,7 @@ BOP's scene_gt.json says T_camera_object for the true camera, so T_world_object 
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -63,6 +64,18 @@ def load_truth(run: Run) -> Truth | None:
             support that isn't there; a move of what isn't there, or at a time that isn't the visit's.
     """
     return read_truth(run, run.catalogue.obj_ids, Checks())
+
+
+def truth_fingerprint(run: Run) -> str:
+    """SHA-256 over names and contents of all files of the truth, which `Run.fingerprint` leaves out."""
+    total = hashlib.sha256()
+    prefixes = tuple(name.removesuffix(".json") for name in (layout.SCENE_GT, layout.SCENE_CAMERA_GT))
+    for visit in run.visits:
+        folder = visit.frames[0].depth_path.parent.parent
+        for file in sorted(path for path in folder.glob("*.json") if path.name.startswith(prefixes)):
+            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            total.update(f"{file.relative_to(run.path).as_posix()} {digest}\n".encode())
+    return total.hexdigest()
 
 
 def read_truth(run: Run, obj_ids: Collection[int], checks: Checks) -> Truth | None:

@@ -20,3 +20,5 @@ class Outcome:
     """None where it didn't run, and for the detector, which has no poses"""
     reason: str = ""
     remedy: str = ""
+    reads_truth: bool = False
+    """whether the method answers from the truth, so that no other is to be held to it"""

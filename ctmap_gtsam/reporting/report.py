@@ -68,6 +68,7 @@ def render(
         has_truth=comparison.truth is not None,
         columns=columns,
         method_rows=tables.method_rows(comparison, outcomes, columns),
+        oracles=[name for name, outcome in outcomes.items() if outcome.reads_truth and outcome.status == "ok"],
         shown=shown,
         pictures=_pictures(run, outcomes, shown, telling_frames(comparison, agreement)),
         legend=_legend(run, outcomes, shown),

@@ -76,14 +76,15 @@ def known_columns(comparison: Comparison) -> list[Column]:
 
 
 def method_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: Sequence[Column]) -> list[Row]:
-    """One row a method: the columns, then seconds; the best of those with poses marked."""
-    posed = [comparison.methods[name].metrics for name, outcome in outcomes.items() if outcome.estimate is not None]
+    """One row a method: the columns, then seconds; the best of those with poses marked, oracles left aside."""
+    competing = {name for name, o in outcomes.items() if o.estimate is not None and not o.reads_truth}
+    posed = [score.metrics for name, score in comparison.methods.items() if name in competing]
     rows = []
     for name, outcome in outcomes.items():
         if outcome.status == "skipped":
             rows.append(Row(name, (), f"skipped: {outcome.reason} {outcome.remedy}".strip()))
             continue
-        rivals = posed if outcome.estimate is not None else []
+        rivals = posed if name in competing else []
         seconds = Cell(NOTHING if outcome.seconds is None else f"{outcome.seconds:.1f}")
         rows.append(Row(name, [*_cells(columns, comparison.methods[name].metrics, rivals), seconds]))
     return rows

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import multiprocessing
+import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,12 +30,15 @@ class Fake:
     metres: float = 0.0
     reason: str | None = None
     ran: Any = None
+    needs: tuple[str, ...] = ()
+    reads_truth: bool = False
 
     def skip(self, run):
         return self.reason
 
-    def run(self, run, config, progress):
+    def run(self, run, config, progress, *needed):
         assert self.kind == "estimate"
+        assert [estimate.meta["method"] for estimate in needed] == list(self.needs)
         if self.ran is not None:
             self.ran.append(self.name)
         meta = {"method": self.name, "seed": config.seed}
@@ -102,6 +106,40 @@ def test_nothing_is_written_into_the_run(path, tmp_path, registry):
     before = {p: p.stat().st_mtime_ns for p in path.rglob("*")}
     compare_run(path, tmp_path, Config(), registry=registry)
     assert {p: p.stat().st_mtime_ns for p in path.rglob("*")} == before
+
+
+def test_what_a_method_builds_on_runs_before_it_and_once(path, tmp_path, registry, ran):
+    builds = Fake("builds", needs=("smooth-ct", "filter-ct"), ran=ran)
+    registry = {"builds": builds, **registry}
+    alone = run_methods(load_run(path), ["builds"], Config(), tmp_path, registry=registry)
+    assert list(alone) == ["builds"]
+    assert ran == ["smooth-ct", "filter-ct", "builds"]
+    needed = run_methods(load_run(path), builds.needs, Config(), tmp_path, registry=registry)
+    assert ran == ["smooth-ct", "filter-ct", "builds"]
+    assert alone["builds"].seconds > sum(outcome.seconds for outcome in needed.values())
+    inside = run_methods(load_run(path), None, Config(), registry=registry)
+    assert ran[3:] == ["smooth-ct", "filter-ct", "builds"]
+    inside["builds"].estimate.save(tmp_path / "inside.npz")
+    assert (tmp_path / "inside.npz").read_bytes() == (tmp_path / "builds.npz").read_bytes()
+
+
+def test_a_method_that_reads_the_truth_is_marked_and_made_again_with_another_truth(path, tmp_path, ran):
+    registry = {"icp-oracle": Fake("icp-oracle", reads_truth=True, ran=ran), "smooth-ct": Fake("smooth-ct", ran=ran)}
+    run = tmp_path / "run"
+    shutil.copytree(path, run)
+    for _ in range(2):
+        compare_run(run, tmp_path / "out", Config(), registry=registry)
+    assert ran == ["icp-oracle", "smooth-ct"]
+    summary = summary_of(tmp_path / "out")
+    assert {name: told["reads_truth"] for name, told in summary["methods"].items()} == {
+        "icp-oracle": True,
+        "smooth-ct": False,
+    }
+    assert "icp-oracle reads the truth" in (tmp_path / "out" / "report.html").read_text()
+    info = run / "test" / "000001" / "scene_gt_info.json"
+    info.write_text(info.read_text() + "\n")
+    compare_run(run, tmp_path / "out", Config(), registry=registry)
+    assert ran == ["icp-oracle", "smooth-ct", "icp-oracle"]
 
 
 def test_what_is_there_is_taken_again(path, tmp_path, registry, ran):

@@ -15,11 +15,10 @@ from typing import Any
 
 from ctmap_gtsam.bench.paper.protocol import Place
 from ctmap_gtsam.runtime.settings import to_dict
-from sequences import layout
 from sequences.atomic import write_json
 from sequences.bop import load_run
 from sequences.errors import InputError
-from sequences.types import Run
+from sequences.truth import truth_fingerprint
 
 MANIFEST = Path(__file__).with_name("manifest.json")
 SCHEMA = 1
@@ -59,23 +58,12 @@ def simulate(folder: Path, place: Place) -> Identity:
 def identify(folder: Path, place: Place) -> Identity:
     """What a place's run hashes to."""
     run = load_run(folder)
-    return Identity(settings=hash_of(to_dict(place.simulation)), run=run.fingerprint, truth=_truth(run))
+    return Identity(settings=hash_of(to_dict(place.simulation)), run=run.fingerprint, truth=truth_fingerprint(run))
 
 
 def hash_of(value: Any) -> str:
     """SHA-256 of what JSON can write."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def _truth(run: Run) -> str:
-    total = hashlib.sha256()
-    for visit in run.visits:
-        folder = visit.frames[0].depth_path.parent.parent
-        prefixes = (layout.SCENE_GT.removesuffix(".json"), layout.SCENE_CAMERA_GT.removesuffix(".json"))
-        for file in sorted(path for path in folder.glob("*.json") if path.name.startswith(prefixes)):
-            digest = hashlib.sha256(file.read_bytes()).hexdigest()
-            total.update(f"{file.relative_to(run.path).as_posix()} {digest}\n".encode())
-    return total.hexdigest()
 
 
 def write_manifest(places: Mapping[int, Identity], path: Path = MANIFEST) -> None:
