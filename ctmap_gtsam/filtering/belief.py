@@ -131,27 +131,33 @@ class Updater:
         self.proposer = proposer
         self.localisation = localisation
 
-    def search(self, track: Track, observation: Observation, around: Surroundings) -> tuple[Array, ...]:
-        """A full search for a track that has just become consistent: for each class poses (n, 4, 4) T_camera_centre."""
+    def search(self, track: Track, observation: Observation, around: Surroundings) -> tuple[PoseModes, ...]:
+        """A full search for a track that has just become consistent: what was found of each class."""
         view = self._first_view(track, observation, around)
-        return tuple(
-            self.proposer.search(
-                shape, view, observation, around, self._rng("filter.search", track.track_id, observation, shape)
-            )
-            for shape in self.model.shapes
-        )
+        return tuple(self._search(track, shape, view, observation, around) for shape in self.model.shapes)
 
-    def start(self, track: Track, observation: Observation, around: Surroundings, found: tuple[Array, ...]) -> Belief:
+    def _search(
+        self, track: Track, shape: Shape, view: View, observation: Observation, around: Surroundings
+    ) -> PoseModes:
+        rng = self._rng("filter.search", track.track_id, observation, shape)
+        starts = self.proposer.search(shape, view, observation, around, rng)
+        return self.proposer.modes(shape, view, starts, probe=False)
+
+    def start(
+        self, track: Track, observation: Observation, around: Surroundings, found: tuple[PoseModes, ...]
+    ) -> Belief:
         """The belief of a track that has just become consistent, from what `search` found of it."""
         view = self._first_view(track, observation, around)
         n = len(self.model.shapes)
         score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
         count = max(self.model.config.filter.particles // n, self.model.config.filter.min_particles)
+        best = np.array([m.log_likelihood.max(initial=-np.inf) for m in found]) + self.model.class_evidence(score_sum)
         classes = []
-        for shape, starts in zip(self.model.shapes, found, strict=True):
+        for shape, modes in zip(self.model.shapes, found, strict=True):
             rng = self._rng("filter.start", track.track_id, observation, shape)
-            proposals = self._in_world(self.proposer.modes(shape, view, starts), observation)
-            classes.append(self._weigh(None, proposals, shape, view, observation, count, rng))
+            likely = best[shape.index] > best.max() - 2.0 * _LIKELY
+            modes = self.proposer.modes(shape, view, modes.T_camera_centre, probe=likely)
+            classes.append(self._weigh(None, self._in_world(modes, observation), shape, view, observation, count, rng))
         fresh = Belief(
             object_id=track.track_id,
             classes=tuple(classes),

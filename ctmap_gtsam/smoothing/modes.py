@@ -28,6 +28,9 @@ from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
 
+_WORTH_A_SEARCH = 30.0
+"""nats behind the best class of the views before beyond which a class isn't searched for any more"""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -135,7 +138,8 @@ def _search(found: Found, track: Track, observation: Observation, place: Place, 
     assert detection is not None
     around = Surroundings((), place.surfaces)
     view = proposer.view(observation, np.array(detection.box), detection, around)
-    for shape in model.shapes:
+    for c in found.within(_WORTH_A_SEARCH):
+        shape = model.shapes[c]
         stage = f"smoother.search.{shape.source.obj_id}"
         rng = generator(model.config.seed, stage, track.track_id, observation.frame.index)
         starts = proposer.search(shape, view, observation, around, rng, model.config.smoother.search_share)

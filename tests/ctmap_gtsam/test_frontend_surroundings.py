@@ -240,3 +240,33 @@ def test_depth_of_a_scene_is_that_of_its_table():
     T = looking(0.2)
     points = se3.transform(T, CAMERA.points(depth_of([], T))[100:140, 100:200].reshape(-1, 3))
     np.testing.assert_allclose(points[:, 2], 0.0, atol=1e-6)
+
+
+def test_a_table_does_not_stand_on_its_own_top_but_a_mug_does():
+    model = model_of("table", "mug")
+    shape, mug = model.shapes[[s.source.name for s in model.shapes].index("table")], shape_named(model, "mug")
+    pose = standing(shape)
+    high = float(se3.transform(pose, shape.hull_points)[:, 2].max())
+    size = np.ptp(shape.mesh.vertices, axis=0)[:2] / 2
+    hull = size * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    top = Plane(np.array([0.0, 0, 1]), high, se3.make(np.eye(3), np.array([0.0, 0, high])), hull, 0.5)
+    assert support_log_potential(model, shape, pose[None], (top,))[0] == 0.0
+    lifted = se3.make(np.eye(3), np.array([0.0, 0.0, high])) @ standing(mug)
+    sunk = se3.make(np.eye(3), np.array([0.0, 0.0, high - 0.03])) @ standing(mug)
+    potential = support_log_potential(model, mug, np.stack([lifted, sunk]), (top,))
+    assert potential[0] > -0.5
+    assert potential[1] < -10.0
+
+
+def test_a_face_of_ones_own_is_no_background_and_the_table_is():
+    model = model_of("cereal_box")
+    (box,) = model.shapes
+    camera = looking(0.4, 0.75, 0.6)
+    observation = view_of(model, [(box, standing(box))], camera)
+    own = np.array(observation.frame.detections[0].box)
+    behind = observation.planes_behind(own)
+    assert len(behind) < len(observation.planes)
+    up = camera[:3, :3].T @ UP
+    assert any(p.normal @ up > 0.95 and abs(p.moved(camera).offset) < 0.01 for p in behind)
+    everything = observation.planes_behind(np.zeros(4))
+    assert everything == observation.planes

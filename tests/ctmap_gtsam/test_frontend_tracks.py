@@ -233,3 +233,20 @@ def test_keyframes_obey_their_rule():
         assert all(np.linalg.norm(at[k] - at[a]) < 0.15 for k in range(a + 1, b))
     still = run_of(CATALOGUE, [frame_of(k, np.eye(4), np.zeros((240, 320), np.float32)) for k in range(5)])
     np.testing.assert_array_equal(select_keyframes(still, Keyframes(min_translation_m=0.1, min_rotation_rad=0.1)), [0])
+
+
+def test_a_box_that_the_images_edge_cuts_is_met_by_its_place_and_class():
+    """Only a part of it is boxed, so boxes don't overlap enough; a box of another class there is another track."""
+    scores = np.array([0.02, 0.02, 0.96])
+    other = np.array([0.02, 0.96, 0.02])
+
+    def part(k, T, low, high, says):
+        whole = box_at(SPOTS[0], T).box
+        box = (whole[0] + low * whole[2], whole[1], (high - low) * whole[2], whole[3])
+        depth = depth_of([], T)
+        return Observation(k, frame_of(k, T, depth, [Detection(box, says)]), depth, ())
+
+    views = [part(k, T, 0.0, 1.0, scores) for k, T in enumerate(cameras(3))]
+    T = cameras(4)[3]
+    assert [t.keyframes for t in tracks_of([*views, part(3, T, 0.7, 1.0, scores)])] == [(0, 1, 2, 3)]
+    assert [t.keyframes for t in tracks_of([*views, part(3, T, 0.7, 1.0, other)])] == [(0, 1, 2)]
