@@ -17,3 +17,5 @@ def limit_library_threads() -> None:
         os.environ.setdefault(name, "1")
     # threads that wait for work spin by default, and on a busy machine take the core from those that have some
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # once Open3D is loaded numba finds its TBB, which is too old, and warns of it
+    os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
