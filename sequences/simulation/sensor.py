@@ -28,10 +28,12 @@ sensor read at fewer pixels. `ctmap bench realism` holds all of this to recordin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from sequences.camera import Camera
 from sequences.seeds import generator
@@ -42,11 +44,15 @@ Field = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
 BASELINE_M = 0.075
+STRENGTH = np.float32(FOCAL_PX * BASELINE_M)  # disparity at 1 m, pixels of the sensor
 RANGE_M = (0.35, 4.5)
 GRAZING_RAD = 1.2  # from this angle of incidence on, less and less light comes back
 EDGE_STEP = 0.02  # neighbours whose depths differ by this share are an edge
-WINDOW_REACH_PX = 0.35  # the window rounds steps of disparity up to about here; across larger ones one side wins
+WINDOW_REACH_PX = 0.8  # the window changes disparity by up to about half of this; across a step one side wins
 DIM = 0.04  # light that comes back, as a share of a white surface's at 1 m, below which measuring gets hard
+UNSURE = 4.5  # how much noisier, as a power of e, depth is that is a standard deviation nearer to being lost
+HOLE_PX = 2.5  # over how many pixels of the sensor depth is lost together
+UNEVEN_OVER = 3.0  # the noise's size changes over so many times the length over which the noise does
 MIRROR_RAD = 0.16  # how far from the mirror direction a glossy surface still dazzles the sensor
 
 
@@ -84,99 +90,111 @@ class DepthSensor:
 
     def measure(self, view: View, rng: np.random.Generator) -> Depth:
         """Depth (h, w) as the sensor gives it, metres, 0 = no measurement; `rng` draws the noise."""
-        c, scale = self._config, self._scale
-        amount = c.depth_noise
+        c, scale, amount = self._config, self._scale, np.float32(self._config.depth_noise)
         if amount == 0.0:
             return view.depth
-        at = _frayed(view.depth.shape, amount * c.lateral_sigma_px * scale, scale, rng)
-        z = view.depth[at].astype(np.float64)
-        near = np.where(z > 0.0, z + amount * view.error_m[at], 1.0)
-        disparity = np.where(z > 0.0, FOCAL_PX * BASELINE_M / near, 0.0)
+        at = _frayed(view.depth.shape, float(amount) * c.lateral_sigma_px * scale, scale, rng)
+        z, error = view.depth[at], view.error_m[at]
+        disparity = np.where(z > 0.0, STRENGTH / np.where(z > 0.0, z + amount * error, 1.0), 0.0)
         disparity = _rounded(disparity, c.window_px * scale)
-        cosine, mirror = _angles(view, at)
-        light = _returned_light(z, cosine, view.albedo[at], view.gloss[at])
-        noise = _patches(z.shape, c.correlation_px * scale, rng) * np.exp(
-            0.5 * c.unevenness * _patches(z.shape, 3.0 * c.correlation_px * scale, rng)
-        )
-        sigma = c.disparity_sigma_px * _grazing_factor(np.arccos(cosine)) * np.sqrt(1.0 + DIM / light)
-        disparity += amount * (sigma * noise + self._distortion)
-        step = min(1.0, amount) * c.quantisation_px
-        if step > 0.0:
-            disparity = np.rint(disparity / step) * step
+        angle, mirror, light = _light(view, at)
         edge = _edges(view.depth, max(1, round(scale * c.edge_px)))
-        tendency = _tendency_to_be_lost(edge, np.arccos(cosine), mirror, light, view.gloss[at])
-        lost = amount * _patches(z.shape, 1.5 * scale, rng) > -tendency
-        seen = (z > 0.0) & (disparity > 0.0) & lit_by_projector(view.depth, scale) & ~lost
-        measured = np.where(seen, FOCAL_PX * BASELINE_M / np.where(seen, disparity, 1.0), 0.0)
+        tendency = _tendency_to_be_lost(edge, angle, mirror, light, view.gloss[at])
+        poor = amount * _patches(z.shape, HOLE_PX * scale, rng) + tendency
+        noise = _uneven(z.shape, c.correlation_px * scale, c.unevenness, rng)
+        noise *= c.disparity_sigma_px * _noise_factor(angle, light, poor)
+        disparity += amount * (noise + self._distortion)
+        step = min(1.0, c.depth_noise) * c.quantisation_px
+        if step > 0.0:
+            disparity = np.rint(disparity / np.float32(step)) * np.float32(step)
+        seen = (z > 0.0) & (disparity > 0.0) & (poor < 0.0) & lit_by_projector(view.depth, scale)
+        measured = np.where(seen, STRENGTH / np.where(seen, disparity, 1.0), 0.0)
         in_range = (measured > RANGE_M[0]) & (measured < RANGE_M[1])
         return np.where(in_range, measured, 0.0).astype(np.float32)
 
 
-def _smooth_field(camera: Camera, length_px: float, rng: np.random.Generator) -> Array:
+@lru_cache(maxsize=4)
+def rays(camera: Camera) -> Field:
+    """(h, w, 3) points at 1 m of depth that the pixels see, camera frame."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    return camera.backproject(u, v, np.ones(u.shape)).astype(np.float32)
+
+
+def _smooth_field(camera: Camera, length_px: float, rng: np.random.Generator) -> Field:
     """(h, w) standard normal numbers that change over so many pixels of the sensor, the same however it is read."""
     knot = length_px / 2.0
     reach = int(np.ceil(SENSOR_WIDTH / knot)) + 4
-    knots = _patches((reach, reach), 2.0 / np.sqrt(2.0), rng)
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    at = np.stack([y, x]) * FOCAL_PX / knot + reach / 2.0
+    knots = _patches((reach, reach), np.sqrt(2.0), rng)
+    at = np.moveaxis(rays(camera)[..., 1::-1], -1, 0) * FOCAL_PX / knot + reach / 2.0
     return np.asarray(map_coordinates(knots, at, order=3, mode="nearest"))
 
 
 def _frayed(
     shape: tuple[int, ...], sigma: float, length: float, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """For each pixel the row and column that it is measured at: neighbours go astray together."""
     rows, columns = np.indices(shape)
-    dv, du = (np.rint(sigma * _patches(shape, length, rng)).astype(np.int64) for _ in range(2))
+    dv, du = (np.rint(np.float32(sigma) * _patches(shape, length, rng)).astype(np.intp) for _ in range(2))
     return np.clip(rows + dv, 0, shape[0] - 1), np.clip(columns + du, 0, shape[1] - 1)
 
 
-def _patches(shape: tuple[int, ...], length: float, rng: np.random.Generator) -> Array:
+def _patches(shape: tuple[int, ...], length: float, rng: np.random.Generator) -> Field:
     """Standard normal numbers (h, w), alike within some pixels: white noise, smoothed and scaled back."""
-    white = rng.standard_normal(shape)
+    white = rng.standard_normal(shape, dtype=np.float32)
     if length <= 0.0:
         return white
-    smooth = gaussian_filter(white, length)
-    reach = np.arange(-int(4 * length) - 1, int(4 * length) + 2)
-    kernel = gaussian_filter((reach == 0).astype(float), length)
-    return np.asarray(smooth / (kernel**2).sum())
+    size = 2 * int(np.ceil(4.0 * length)) + 1
+    smooth = cv2.GaussianBlur(white, (size, size), length)
+    return np.asarray(smooth / np.float32((cv2.getGaussianKernel(size, length) ** 2).sum()))
 
 
-def _rounded(disparity: Array, window_px: float) -> Array:
+def _uneven(shape: tuple[int, ...], length: float, unevenness: float, rng: np.random.Generator) -> Field:
+    """Numbers (h, w) of variance 1, alike within some pixels, whose size differs from place to place (log-normal)."""
+    size = np.float32(0.5 * unevenness) * _patches(shape, UNEVEN_OVER * length, rng) - np.float32(0.25 * unevenness**2)
+    return _patches(shape, length, rng) * np.exp(size)
+
+
+def _rounded(disparity: Field, window_px: float) -> Field:
     """The mean over the window, wherever what it holds is one surface: edges and hollows lose their sharpness."""
     if window_px <= 0.0:
         return disparity
-    change = gaussian_filter(disparity, window_px, truncate=2.0) - disparity
-    return disparity + change * np.exp(-0.5 * (change / WINDOW_REACH_PX) ** 2)
+    size = 2 * int(np.ceil(2.0 * window_px)) + 1
+    change = cv2.GaussianBlur(disparity, (size, size), window_px, borderType=cv2.BORDER_REPLICATE) - disparity
+    return disparity + change * np.exp(np.float32(-0.5) * (change / np.float32(WINDOW_REACH_PX)) ** 2)
 
 
-def _angles(view: View, at: tuple[NDArray[np.int64], NDArray[np.int64]]) -> tuple[Array, Array]:
-    """(h, w) cosine of the angle of incidence, and the angle between normal and mirror direction, rad."""
-    camera, z = view.camera, view.depth[at]
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    point = camera.backproject(u, v, np.where(z > 0.0, z, 1.0))
-    to_camera = -point / np.linalg.norm(point, axis=-1, keepdims=True)
-    to_projector = np.array([BASELINE_M, 0.0, 0.0]) - point
-    half = to_camera + to_projector / np.linalg.norm(to_projector, axis=-1, keepdims=True)
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    normal = view.normal[at]
-    cosine = np.clip(np.einsum("hwk,hwk->hw", normal, to_camera), 1e-3, 1.0)
-    return cosine, np.arccos(np.clip(np.einsum("hwk,hwk->hw", normal, half), -1.0, 1.0))
+def _light(view: View, at: tuple[NDArray[np.intp], NDArray[np.intp]]) -> tuple[Field, Field, Field]:
+    """How the projector's light meets the surfaces and what of it comes back.
 
-
-def _returned_light(z: Array, cosine: Array, albedo: Field, gloss: Field) -> Array:
-    """(h, w) how much of the projector's light comes back, 1 from white paper that faces the sensor at 1 m.
-
-    A glossy surface sends light away that meets it at an angle.
+    Returns:
+        (h, w) each: angle of incidence of the line of sight, rad; angle between the normal and that of a mirror which
+        would throw the projector's light into the camera, rad; the light that comes back, 1 from white paper that
+        faces the projector at 1 m. A glossy surface sends light away that meets it at an angle.
     """
-    scattered = albedo * (1.0 - gloss * (1.0 - cosine))
-    return np.maximum(scattered * cosine / np.maximum(z, 0.1) ** 2, 1e-4)
+    z = view.depth[at]
+    point = rays(view.camera) * np.where(z > 0.0, z, np.float32(1.0))[..., None]
+    to_camera = -_unit(point)
+    to_projector = _unit(np.array([BASELINE_M, 0.0, 0.0], dtype=np.float32) - point)
+    normal = view.normal[at]
+    cosine, lit, facing = (
+        np.clip(np.einsum("hwk,hwk->hw", normal, direction), 1e-3, 1.0)
+        for direction in (to_camera, to_projector, _unit(to_camera + to_projector))
+    )
+    scattered = view.albedo[at] * (1.0 - view.gloss[at] * (1.0 - lit))
+    return np.arccos(cosine), np.arccos(facing), np.maximum(scattered * lit / np.maximum(z, 0.1) ** 2, 1e-4)
 
 
-def _grazing_factor(angle: Array) -> Array:
-    """Growth of the noise with the angle of incidence, 1 where the surface faces the camera, after Nguyen et al."""
-    return 1.0 + 0.07 * angle**2 / np.maximum(np.pi / 2.0 - angle, 0.05) ** 2
+def _unit(vectors: Field) -> Field:
+    return np.asarray(vectors / np.sqrt(np.einsum("hwk,hwk->hw", vectors, vectors))[..., None])
+
+
+def _noise_factor(angle: Field, light: Field, poor: Field) -> Field:
+    """(h, w) growth of the noise, 1 on white paper that faces the camera.
+
+    With the angle of incidence after Nguyen et al., where little light comes back, and where depth is nearly lost.
+    """
+    grazing = 1.0 + 0.07 * angle**2 / np.maximum(np.pi / 2.0 - angle, 0.05) ** 2
+    return np.asarray(grazing * np.sqrt(1.0 + DIM / light) * np.exp(UNSURE * np.clip(poor + 1.0, 0.0, 1.0)))
 
 
 def lit_by_projector(depth: Depth, scale: float = 1.0) -> NDArray[np.bool_]:
@@ -190,7 +208,7 @@ def lit_by_projector(depth: Depth, scale: float = 1.0) -> NDArray[np.bool_]:
         scale: pixels of the image a pixel of the sensor.
     """
     with np.errstate(divide="ignore"):
-        disparity = np.where(depth > 0.0, FOCAL_PX * BASELINE_M * scale / depth, 0.0)
+        disparity = np.where(depth > 0.0, STRENGTH * scale / depth, 0.0)
     column = np.arange(depth.shape[1]) - disparity
     nearest_right = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
     return np.asarray(column <= nearest_right + 0.5)
@@ -202,12 +220,12 @@ def _edges(depth: Depth, reach: int) -> NDArray[np.bool_]:
     return np.asarray(high - low > EDGE_STEP * reach * np.maximum(high, 0.1))
 
 
-def _tendency_to_be_lost(edge: NDArray[np.bool_], angle: Array, mirror: Array, light: Array, gloss: Field) -> Array:
+def _tendency_to_be_lost(edge: NDArray[np.bool_], angle: Field, mirror: Field, light: Field, gloss: Field) -> Field:
     """(h, w) in standard deviations of the patches in which depth is lost."""
     grazing = 14.0 * np.maximum(angle - GRAZING_RAD, 0.0)
     dark = 1.5 * np.log(np.maximum(DIM / light, 1.0))
     dazzled = 6.0 * gloss * np.exp(-((mirror / MIRROR_RAD) ** 2))
-    return -3.3 + 2.6 * edge + grazing + dark + dazzled
+    return np.asarray(-2.7 + 2.4 * edge.astype(np.float32) + grazing + dark + dazzled)
 
 
 def measure_colour(exact: NDArray[np.uint8], config: SensorConfig, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -22,12 +22,13 @@ from sequences.catalogue import Mesh
 from sequences.rendering.scene import SceneImages
 from sequences.seeds import generator
 from sequences.simulation.config import SensorConfig
-from sequences.simulation.sensor import View
+from sequences.simulation.sensor import View, rays
 
 Array = NDArray[np.float64]
 
 CELLS = 32  # of the periodic volume that all fields are cut from, each way
 SMOOTH_CELLS = 1.5
+TAILS = 0.3  # h
 DEEPEST_DYE = 0.15  # share of near infrared light that a black dye still scatters: most are less dark there
 
 
@@ -67,10 +68,15 @@ def surface_error(inst_id: int, diameter_m: float, config: SensorConfig, seed: i
 
 @cache
 def _volume() -> Array:
-    """Standard normal numbers on a periodic grid, alike over SMOOTH_CELLS."""
+    """Numbers of robust sigma 1 on a periodic grid, alike over SMOOTH_CELLS: Tukey's h distribution, long tails.
+
+    Most of a mesh is true, and some of it isn't at all.
+    """
     white = generator(0, "simulation.surface.volume").standard_normal((CELLS, CELLS, CELLS))
     smooth = gaussian_filter(white, SMOOTH_CELLS, mode="wrap")
-    return np.asarray((smooth - smooth.mean()) / smooth.std())
+    normal = np.clip((smooth - smooth.mean()) / smooth.std(), -3.0, 3.0)
+    field = normal * np.exp(0.5 * TAILS * normal**2)
+    return np.asarray(field / (1.4826 * np.median(np.abs(field))))
 
 
 class Surfaces:
@@ -94,24 +100,22 @@ class Surfaces:
         """What a camera that drew them as `images` has before it."""
         face = np.where(images.item >= 0, self._start[images.item] + images.face, len(self._normals) - 1)
         normal = self._normals[face] @ T_world_camera[:3, :3].astype(np.float32)
-        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-        outwards = np.einsum("hwk,hwk->hw", normal, rays) < 0.0
+        outwards = np.einsum("hwk,hwk->hw", normal, rays(camera)) < 0.0
         return View(
             camera=camera,
             depth=images.depth,
             normal=np.where(outwards[..., None], normal, -normal),
             albedo=self._albedo[face],
             gloss=self._gloss[images.item],
-            error_m=self._error(images, rays, T_world_camera),
+            error_m=self._error(images, rays(camera), T_world_camera),
         )
 
-    def _error(self, images: SceneImages, rays: Array, T_world_camera: Array) -> NDArray[np.float32]:
+    def _error(self, images: SceneImages, ray: NDArray[np.float32], T_world_camera: Array) -> NDArray[np.float32]:
         out = np.zeros(images.depth.shape, dtype=np.float32)
         for k in np.unique(images.item[images.item >= 0]):
             here = images.item == k
             T_object_camera = se3.inverse(self._T_world_object[k]) @ T_world_camera
-            points = se3.transform(T_object_camera, rays[here] * images.depth[here][:, None].astype(np.float64))
+            points = se3.transform(T_object_camera, ray[here].astype(np.float64) * images.depth[here][:, None])
             out[here] = self._errors[k].at(points)
         return out
 
