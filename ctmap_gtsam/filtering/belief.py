@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
-_DORMANT = 45.0  # nats behind the best class beyond which a class is weighed only when there is a search
+_DORMANT = 45.0  # nats behind the best class beyond which a class is weighed now and then
+_WAKE_EVERY = 15  # keyframes in view
 _IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
 _MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
 _REPORTED = 0.01  # classes less probable than this are not reported with poses
@@ -74,6 +75,17 @@ class Belief:
         """(C,) log evidence of each class at this place, prior included."""
         depth = np.array([-np.inf if c is None else c.log_evidence for c in self.classes])
         return depth + self.score_evidence + model.class_evidence(self.score_sum) - np.log(len(self.classes))
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """What one class of one object is worth at a keyframe."""
+
+    particles: int
+    likely: bool
+    """near enough to the best class to be looked at closely"""
+    search: bool
+    """afresh, beside what is believed"""
 
 
 @dataclass(frozen=True)
@@ -308,13 +320,13 @@ class Updater:
         behind: Array,
     ) -> tuple[ClassBelief | None, ...]:
         """Every class; those far behind the best (C,) only now and then: in between they keep their distance to it."""
-        search = self._search_due(belief)
-        awake = search | (behind > -_DORMANT)
-        stepped = {
-            c: self._step_class(belief, shape, view, observation, around, int(counts[c]), behind[c] > -_LIKELY)
-            for c, shape in enumerate(self.model.shapes)
-            if awake[c]
-        }
+        possible = behind > -_DORMANT
+        awake = possible | (belief.steps % _WAKE_EVERY == 0)
+        search = view.detection is not None and belief.steps % self.model.config.filter.search_every == 0
+        stepped = {}
+        for c in np.flatnonzero(awake):
+            effort = _Effort(int(counts[c]), likely=bool(behind[c] > -_LIKELY), search=search and bool(possible[c]))
+            stepped[int(c)] = self._step_class(belief, self.model.shapes[c], view, observation, around, effort)
         best = int(np.argmax(behind))
         before, after = belief.classes[best], stepped[best]
         gained = after.log_evidence - before.log_evidence if before is not None and after is not None else 0.0
@@ -323,9 +335,6 @@ class Updater:
         )
         return tuple(stepped[c] if awake[c] else own for c, own in enumerate(asleep))
 
-    def _search_due(self, belief: Belief) -> bool:
-        return belief.steps % self.model.config.filter.search_every == 0
-
     def _step_class(
         self,
         belief: Belief,
@@ -333,22 +342,21 @@ class Updater:
         view: View,
         observation: Observation,
         around: Surroundings,
-        count: int,
-        likely: bool,
+        effort: _Effort,
     ) -> ClassBelief | None:
         own = belief.classes[shape.index]
-        if not likely:
+        if not effort.likely:
             view = view.coarse()
         rng = self._rng("filter.step", belief.object_id, observation, shape)
         starts = np.zeros((0, 4, 4))
         if own is not None:
             starts = observation.frame.T_camera_world @ own.particles.best(3)
-        if view.detection is not None and self._search_due(belief):
+        if effort.search:
             found = self.proposer.search(shape, view, observation, around, rng, self.model.config.filter.search_share)
             starts = np.concatenate([starts, found])
-        proposals = self._in_world(self.proposer.modes(shape, view, starts, probe=likely), observation)
+        proposals = self._in_world(self.proposer.modes(shape, view, starts, probe=effort.likely), observation)
         spread = self._spread(observation, belief.time_ns, starts)
-        return self._weigh(own, proposals, shape, view, observation, count, rng, spread)
+        return self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
