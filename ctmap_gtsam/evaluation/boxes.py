@@ -142,6 +142,27 @@ def judge_boxes(
     )
 
 
+def pooled_boxes(tables: Sequence[JudgedBoxes], class_names: Sequence[Sequence[str]]) -> JudgedBoxes:
+    """Boxes of several runs as of one. Classes are the same where their names are, and are ordered by name.
+
+    Args:
+        tables: one a run.
+        class_names: of each run's catalogue.
+    """
+    names = {name: c for c, name in enumerate(sorted({name for known in class_names for name in known}))}
+    columns = [np.array([names[name] for name in known], dtype=np.int64) for known in class_names]
+    positives = np.zeros(len(names), dtype=np.int64)
+    for table, column in zip(tables, columns, strict=True):
+        positives[column] += table.positives
+    return JudgedBoxes(
+        category=np.concatenate([c[t.category] for t, c in zip(tables, columns, strict=True)]),
+        score=np.concatenate([t.score for t in tables]),
+        true_positive=np.concatenate([t.true_positive for t in tables]),
+        ignored=np.concatenate([t.ignored for t in tables]),
+        positives=positives,
+    )
+
+
 def average_precision(boxes: JudgedBoxes) -> Array:
     """(C,) AP of each class: the mean over RECALLS of the best precision at that recall or more; NaN without a box."""
     out = np.full(len(boxes.positives), np.nan)

@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation import calibration, frames, moves, trajectory, visits
-from ctmap_gtsam.evaluation.boxes import JudgedBoxes, TrueBoxes, judge_boxes, mean_average_precision, true_boxes
+from ctmap_gtsam.evaluation.boxes import (
+    JudgedBoxes,
+    TrueBoxes,
+    judge_boxes,
+    mean_average_precision,
+    pooled_boxes,
+    true_boxes,
+)
 from ctmap_gtsam.evaluation.calibration import ExistenceSamples, PoseSamples
 from ctmap_gtsam.evaluation.detection import best_classes, score_detections
 from ctmap_gtsam.evaluation.frames import FrameErrors
@@ -239,11 +246,11 @@ def record(run: Run, truth: Truth, name: str, estimate: Estimate | None) -> Reco
 
 def pooled(records: Sequence[Record]) -> dict[str, float | None]:
     """All METRICS of one method over several runs; None where there is none. A run may be among them repeatedly."""
-    names = sorted({name for r in records for name in r.class_names})
+    names = [r.class_names for r in records]
     at_frames = _together([r.frames for r in records])
     metrics: dict[str, float | None] = dict.fromkeys(METRICS)
-    metrics["map_50"] = mean_average_precision(_boxes([r.boxes for r in records], records, names))
-    metrics["map_50_paper"] = mean_average_precision(_boxes([r.final_boxes for r in records], records, names))
+    metrics["map_50"] = mean_average_precision(pooled_boxes([r.boxes for r in records], names))
+    metrics["map_50_paper"] = mean_average_precision(pooled_boxes([r.final_boxes for r in records], names))
     metrics |= frames.class_metrics(at_frames)
     if all(r.posed for r in records):
         metrics |= frames.pose_metrics(at_frames)
@@ -296,19 +303,3 @@ def _together(tables: Sequence[Table]) -> Table:
 
 def _empty(kind: type[Any]) -> Any:
     return kind(**{f.name: np.zeros(0) for f in fields(kind)})
-
-
-def _boxes(tables: Sequence[JudgedBoxes], records: Sequence[Record], names: Sequence[str]) -> JudgedBoxes:
-    """Boxes of several runs as of one; classes are the same where their names are."""
-    row = {name: c for c, name in enumerate(names)}
-    columns = [np.array([row[name] for name in r.class_names], dtype=np.int64) for r in records]
-    positives = np.zeros(len(names), dtype=np.int64)
-    for table, column in zip(tables, columns, strict=True):
-        np.add.at(positives, column, table.positives)
-    return JudgedBoxes(
-        category=np.concatenate([c[t.category] for t, c in zip(tables, columns, strict=True)]),
-        score=np.concatenate([t.score for t in tables]),
-        true_positive=np.concatenate([t.true_positive for t in tables]),
-        ignored=np.concatenate([t.ignored for t in tables]),
-        positives=positives,
-    )

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ctmap_gtsam.evaluation import pose
 from sequences import se3
+from sequences.camera import Camera
 from sequences.catalogue import ContinuousSymmetry, Mesh, ObjectClass
 
 HALF_TURN = se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
@@ -140,6 +141,49 @@ def test_mssd_equals_its_definition_over_all_vertices(seed):
         for k in range(4)
     ]
     np.testing.assert_allclose(pose.mssd(shape, A, B), expected, rtol=1e-12)
+
+
+CAMERA = Camera(500.0, 450.0, 300.0, 200.0, 640, 480)
+
+
+def before_camera(seed, n):
+    rng = np.random.default_rng(seed)
+    return se3.make(se3.uniform_rotations(rng.random((n, 3))), rng.normal(size=(n, 3)) * 0.1 + [0, 0, 1.5])
+
+
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_mspd_equals_its_definition(seed):
+    shape = box(discrete=QUARTER_TURNS)
+    A, B = before_camera(seed, 4), before_camera(seed + 1, 4)
+    vertices = shape.of.mesh.vertices
+    x = CAMERA.project(se3.transform(A, vertices))
+    expected = [
+        min(np.linalg.norm(x[k] - CAMERA.project(se3.transform(B[k] @ S, vertices)), axis=-1).max()
+            for S in QUARTER_TURNS)
+        for k in range(4)
+    ]  # fmt: skip
+    np.testing.assert_allclose(pose.mspd(shape, A, B, CAMERA), expected, rtol=1e-9)
+    np.testing.assert_allclose(pose.mspd(shape, B @ QUARTER_TURNS[2], B, CAMERA), 0, atol=1e-9)
+
+
+def test_mspd_by_hand():
+    """A centimetre to the side: the nearest vertex moves most, f dx / z; along the axis, the outermost one."""
+    shape, T = box(size=(0.2, 0.1, 0.06), centre=(0, 0, 0)), se3.make(np.eye(3), np.array([0, 0, 1.03]))
+    aside, further = T.copy(), T.copy()
+    aside[0, 3] += 0.01
+    assert pose.mspd(shape, aside, T, CAMERA) == pytest.approx(500.0 * 0.01 / 1.0)
+    further[2, 3] += 0.25
+    corner = np.hypot(500.0 * 0.1, 450.0 * 0.05)
+    assert pose.mspd(shape, further, T, CAMERA) == pytest.approx(corner / 1.0 - corner / 1.25)
+
+
+def test_what_lies_behind_the_camera_has_no_image():
+    shape, T = box(centre=(0, 0, 0)), se3.make(np.eye(3), np.array([0, 0, 1.0]))
+    behind = se3.make(np.eye(3), np.array([0, 0, -1.0]))
+    assert pose.mspd(shape, behind, T, CAMERA) == np.inf
+    reaching = se3.make(np.eye(3), np.array([0, 0, 0.02]))  # some corners are behind, and don't count
+    assert pose.mspd(shape, reaching, reaching, CAMERA) == 0
 
 
 def test_adds_equals_its_definition():
