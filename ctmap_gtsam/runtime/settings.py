@@ -199,9 +199,15 @@ def _to_float(value: float) -> float:
         return math.inf
 
 
+_TYPED: dict[type, tuple[tuple[Field[Any], Any], ...]] = {}
+
+
 def _typed(kind: type) -> tuple[tuple[Field[Any], Any], ...]:
-    hints = get_type_hints(kind)
-    return tuple((f, hints[f.name]) for f in fields(kind))
+    """Its fields and their types, which take a while to find."""
+    if kind not in _TYPED:
+        hints = get_type_hints(kind)
+        _TYPED[kind] = tuple((f, hints[f.name]) for f in fields(kind))
+    return _TYPED[kind]
 
 
 def _leaves(settings: Any, path: str = "") -> Iterator[tuple[str, Field[Any], Any, Any]]:

@@ -98,7 +98,7 @@ class Agenda:
         self._missing = {place: self._undone(some) for place, some in units.items()}
         self._made = {place for place in units if store.identity(place) is not None and store.run(place).is_dir()}
         self._identified = {place for place in units if store.identity(place) is not None}
-        self._running: dict[Place, int] = dict.fromkeys(units, 0)
+        self._running: dict[Place, list[MakePlace | MakeUnit]] = {place: [] for place in units}
         self._began: dict[str, float] = {}
         self.failures: list[Failure] = []
 
@@ -120,11 +120,12 @@ class Agenda:
                 if self._running[place]:
                     continue
                 job = MakePlace(self._store, place)
-            elif missing:
-                job = MakeUnit(self._store, missing.pop(0), self._registry)
+            elif (unit := self._ready(place)) is not None:
+                missing.remove(unit)
+                job = MakeUnit(self._store, unit, self._registry)
             else:
                 continue
-            self._running[place] += 1
+            self._running[place].append(job)
             self._began[str(job)] = time.perf_counter()
             return job
         return None
@@ -133,7 +134,7 @@ class Agenda:
         """Note what it left."""
         assert isinstance(job, MakePlace | MakeUnit)
         place = job.place if isinstance(job, MakePlace) else job.unit.place
-        self._running[place] -= 1
+        self._running[place].remove(job)
         if isinstance(job, MakePlace):
             self._identified.add(place)
             self._made.add(place)
@@ -145,9 +146,18 @@ class Agenda:
         if not self._missing[place] and not self._running[place] and not self._keep_runs:
             shutil.rmtree(self._store.run(place), ignore_errors=True)
 
+    def _ready(self, place: Place) -> Unit | None:
+        """The first missing unit that waits for no other; what it needs may have failed, which it will notice."""
+        missing = self._missing[place]
+        running = [job.unit for job in self._running[place] if isinstance(job, MakeUnit)]
+        waited_for = {(unit.variant, unit.method, unit.seed) for unit in (*missing, *running)}
+        return next(
+            (u for u in missing if not any((n.variant, n.method, n.seed) in waited_for for n in u.needed)), None
+        )
+
     def _announce(self, job: MakePlace | MakeUnit, failed: bool) -> None:
         self._ended += 1
-        of = self._ended + self.jobs + sum(self._running.values())
+        of = self._ended + self.jobs + sum(map(len, self._running.values()))
         seconds = time.perf_counter() - self._began[str(job)]
         how = f"failed: {self.failures[-1].reason}  (see {job.log})" if failed else f"{seconds:.1f} s"
         for listener in self._listeners:

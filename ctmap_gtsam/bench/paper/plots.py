@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN
 from ctmap_gtsam.bench.paper.results import TABLE_I
+from ctmap_gtsam.bench.paper.tables import said
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +25,12 @@ def write_plots(folder: Path, result: Mapping[str, Any]) -> None:
     from sequences.atomic import write_bytes, write_text
 
     with mpl.rc_context(STYLE):
-        drawn = {"table-i": table_i(result), "places": by_place(result), "changes": changes(result)}
+        drawn = {
+            "table-i": table_i(result),
+            "pose-accuracy": pose_accuracy(result),
+            "places": by_place(result),
+            "changes": changes(result),
+        }
         for name, figure in drawn.items():
             if figure is None:
                 continue
@@ -39,7 +45,7 @@ def table_i(result: Mapping[str, Any]) -> Figure | None:
     rows = [row for row in result["rows"] if row["pass"] == MAIN and row["figures"].get(TABLE_I) is not None]
     if not rows:
         return None
-    figure, (ax,) = _figure(1, (7.2, 0.9 + 0.34 * len(rows)))
+    figure, (ax,) = _figure((1, 1), (7.2, 0.9 + 0.34 * len(rows)))
     for y, row in enumerate(rows):
         _dot(ax, y, row["figures"][TABLE_I], row["intervals"].get(TABLE_I), _colour(row["method"]))
         paper = result["paper"].get(row["method"])
@@ -49,8 +55,33 @@ def table_i(result: Mapping[str, Any]) -> Figure | None:
     ax.plot([], [], "D", color="none", markeredgecolor="#1b1b1b", label="the paper, on its own sequences")
     ax.set_xlim(0.0, 1.02)
     ax.set_xlabel("mAP by the paper's protocol")
-    _name_rows(ax, [row["method"] for row in rows])
+    _name_rows(ax, [said(row["method"], result) for row in rows])
     ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=8)
+    return figure
+
+
+def pose_accuracy(result: Mapping[str, Any]) -> Figure | None:
+    """The paper's pose figure: accuracy over both thresholds, at the last-seen frames and over all frames."""
+    curves = result["curves"]
+    kinds = {"last_seen": "map at the visit's end,\nwhere last seen (the paper's)", "own_frames": "each frame's own"}
+    if not curves["last_seen"]:
+        return None
+    angles, within = curves["within_deg"], [1e2 * m for m in curves["within_m"]]
+    figure, panels = _figure((len(kinds), len(angles)), (10.4, 5.2))
+    for ax, (kind, n) in zip(panels, ((kind, n) for kind in kinds for n in range(len(angles))), strict=True):
+        for method, values in curves[kind].items():
+            dashed = "--" if method in result["reads_truth"] else "-"
+            ax.plot(within, values[n], dashed, color=_colour(method), linewidth=1.6, label=said(method, result))
+        ax.set_xlim(0.0, within[-1])
+        ax.set_ylim(0.0, 1.02)
+        if kind == "last_seen":
+            ax.set_title(f"within {angles[n]:g}°", loc="left", fontsize=10)
+        else:
+            ax.set_xlabel("and within, cm")
+        if n == 0:
+            ax.set_ylabel(f"share of objects\n{kinds[kind]}", fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8)
     return figure
 
 
@@ -61,10 +92,10 @@ def by_place(result: Mapping[str, Any]) -> Figure | None:
     order = _from_hard_to_easy(rows, seeds)
     if not order:
         return None
-    figure, (ax,) = _figure(1, (9.0, 4.2))
+    figure, (ax,) = _figure((1, 1), (9.0, 4.2))
     for row in rows:
         values = [row["by_place"].get(seed, {}).get(TABLE_I) for seed in order]
-        quiet = row["method"] not in _COLOURS
+        quiet = row["method"] not in _MAIN_ROWS
         ax.plot(
             range(len(order)),
             [float("nan") if v is None else v for v in values],
@@ -88,7 +119,7 @@ def changes(result: Mapping[str, Any]) -> Figure | None:
     found = [d for d in found if d["figures"].get(TABLE_I) is not None]
     if not found:
         return None
-    figure, (ax,) = _figure(1, (7.2, 0.9 + 0.3 * len(found)))
+    figure, (ax,) = _figure((1, 1), (7.2, 0.9 + 0.3 * len(found)))
     for y, d in enumerate(found):
         _dot(ax, y, d["figures"][TABLE_I], d["intervals"].get(TABLE_I), _colour(d["row"][1]))
     ax.axvline(0.0, color="#50565e", linewidth=1)
@@ -99,23 +130,32 @@ def changes(result: Mapping[str, Any]) -> Figure | None:
 
 _COLOURS = {
     "detector": "#8a8f98",
+    "icp": "#cc79a7",
+    "fpfh": "#117733",
+    "icp-oracle": "#cc79a7",
+    "fpfh-oracle": "#117733",
+    "static-fusion": "#8c564b",
     "filter-t": "#e69f00",
     "filter-ct": "#d55e00",
+    "last-copied-back": "#332288",
     "smooth-t": "#56b4e9",
     "smooth-ct": "#0072b2",
     CEILING: "#1b1b1b",
 }
 
 
+_MAIN_ROWS = ("detector", "filter-t", "filter-ct", "smooth-t", "smooth-ct", CEILING)
+
+
 def _colour(method: str) -> str:
     return _COLOURS.get(method, "#b9bdc4")
 
 
-def _figure(panels: int, size: tuple[float, float]) -> tuple[Figure, Sequence[Axes]]:
+def _figure(shape: tuple[int, int], size: tuple[float, float]) -> tuple[Figure, Sequence[Axes]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    return figure, [figure.add_subplot(1, panels, k + 1) for k in range(panels)]
+    return figure, [figure.add_subplot(*shape, k + 1) for k in range(shape[0] * shape[1])]
 
 
 def _dot(ax: Axes, y: float, value: float, span: Sequence[float] | None, colour: str) -> None:

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.bench.paper.bootstrap import draws, interval, redrawn
 from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN, Protocol, Variant
-from ctmap_gtsam.evaluation.record import DETECTOR, pooled
+from ctmap_gtsam.evaluation.record import DETECTOR, Record, pooled, pose_curve
 from sequences.progress import SILENT, Progress
-
-if TYPE_CHECKING:
-    from ctmap_gtsam.evaluation.record import Record
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -24,6 +21,10 @@ Key = tuple[str, str]
 
 TABLE_I = "map_50_paper"
 """The metric of the paper's Table I"""
+
+WITHIN_M = np.linspace(0.0, 0.1, 21)
+WITHIN_DEG = np.array([5.0, 10.0, 20.0, 45.0])
+"""Thresholds of the curves of pose accuracy"""
 
 BY_PLACE = (TABLE_I, "map_50", "class_accuracy", "mssd_mm_median")
 """Figures that are kept of single places"""
@@ -71,6 +72,13 @@ class Results:
     def by_place(self, key: Key) -> dict[int, dict[str, float | None]]:
         """The figures of single places."""
         return {seed: pooled(self._records[key][seed]) for seed in self.seeds(key)}
+
+    def curve(self, key: Key, *, last_seen: bool) -> Array | None:
+        """Pose accuracy at WITHIN_DEG (rows) and WITHIN_M (columns); None where a method has no poses."""
+        records = [r for some in self._records[key].values() for r in some]
+        if not all(r.posed for r in records):
+            return None
+        return pose_curve(records, WITHIN_M, np.deg2rad(WITHIN_DEG)[:, None], last_seen=last_seen)
 
     def row(self, key: Key, seeds: tuple[int, ...] | None = None) -> Row:
         """A row over all the places that it has, or over some of them."""
@@ -136,6 +144,19 @@ def rows_json(results: Results, seeds: Sequence[int], seconds: Mapping[Key, floa
                 "seconds": round(seconds[key], 1),
             }
         )
+    return out
+
+
+def curves_json(results: Results) -> dict[str, Any]:
+    """The paper's pose figure, of the main pass: {"last_seen" | "own_frames": {method: one list an angle}}."""
+    out: dict[str, Any] = {"within_m": WITHIN_M.round(4).tolist(), "within_deg": WITHIN_DEG.tolist()}
+    for name, last_seen in (("last_seen", True), ("own_frames", False)):
+        drawn = {key[1]: results.curve(key, last_seen=last_seen) for key in results.keys if key[0] == MAIN}
+        out[name] = {
+            method: np.where(np.isfinite(curve), curve, 0.0).round(5).tolist()
+            for method, curve in drawn.items()
+            if curve is not None
+        }
     return out
 
 

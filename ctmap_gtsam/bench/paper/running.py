@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from ctmap_gtsam.bench.paper import places as frozen
 from ctmap_gtsam.bench.paper.agenda import Agenda, Failure, Say
 from ctmap_gtsam.bench.paper.places import Identity
 from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN, Place, Protocol, Variant, load_protocol
-from ctmap_gtsam.bench.paper.results import Key, Results, differences_json, rows_json
+from ctmap_gtsam.bench.paper.results import Key, Results, curves_json, differences_json, rows_json
 from ctmap_gtsam.bench.paper.units import Store, Unit
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.runtime.pool import work_off
@@ -162,6 +162,7 @@ def _summarise(
     identities = _identities(store, there)
     results = Results(records, task.seeds, DRAWS, workshop.progress)
     rows = rows_json(results, task.seeds, seconds)
+    oracles = [name for name, method in workshop.methods().items() if method.reads_truth]
     return {
         "schema": SCHEMA,
         "name": "paper",
@@ -176,6 +177,8 @@ def _summarise(
         "figures": {f"{r['method']}.{k}": v for r in rows if r["pass"] == MAIN for k, v in r["figures"].items()},
         "rows": rows,
         "differences": differences_json(results, task.protocol),
+        "curves": curves_json(results),
+        "reads_truth": [*oracles, CEILING],
         "skipped": skipped,
         "failures": [{"job": f.job, "log": str(f.log), "reason": f.reason} for f in failures],
         "config": to_dict(store.config),
@@ -185,20 +188,22 @@ def _summarise(
 
 
 def _wanted(place: Place, config: Config, task: Task, workshop: Workshop) -> tuple[Unit, ...]:
-    """The units of a place: those of the passes wanted, and those of the main pass that they are held to."""
-    every = (*workshop.methods(), CEILING)
+    """The units of a place: those of the passes wanted, those that they build on, those that they are held to."""
+    registry = workshop.methods()
+    every = (*registry, CEILING)
+    needs = {method: registry[method].needs if method in registry else () for method in every}
     main = task.protocol.variants[MAIN]
-    wanted = {
-        (v.name, method): v for v in task.passes for method in v.methods or every if _chosen(method, task.methods)
-    }
+    wanted: dict[tuple[str, str], Variant] = {}
     for variant in task.passes:
+        for method in filter(_chosen(task.methods), variant.methods or every):
+            wanted |= {(variant.name, one): variant for one in (*needs.get(method, ()), method)}
         wanted |= {(MAIN, method): main for method in variant.main}
     seeds = range(config.seed, config.seed + task.repeats)
-    return tuple(Unit(v, place, m, s) for (_, m), v in wanted.items() if m in every for s in seeds)
+    return tuple(Unit(v, place, m, s, needs[m]) for (_, m), v in wanted.items() if m in every for s in seeds)
 
 
-def _chosen(method: str, methods: tuple[str, ...] | None) -> bool:
-    return methods is None or method in methods
+def _chosen(methods: tuple[str, ...] | None) -> Callable[[str], bool]:
+    return lambda method: methods is None or method in methods
 
 
 def _check_methods(task: Task, workshop: Workshop) -> None:

@@ -25,6 +25,8 @@ from ctmap_gtsam.bench.paper.places import Identity, hash_of, simulate
 from ctmap_gtsam.bench.paper.protocol import CEILING, Place, Variant
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.evaluation.ceiling import truth_estimate
+from ctmap_gtsam.evaluation.record import Record, record
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.sources import Code, code
 from sequences.atomic import write_json
@@ -35,7 +37,6 @@ from sequences.seeds import generator
 from sequences.types import Run, Truth
 
 if TYPE_CHECKING:
-    from ctmap_gtsam.evaluation.record import Record
     from ctmap_gtsam.methods import Method
 
 _RECORD = ".record.npz"
@@ -50,6 +51,13 @@ class Unit:
     method: str
     seed: int
     """of the method's draws"""
+    needs: tuple[str, ...] = ()
+    """methods on whose estimates it builds"""
+
+    @property
+    def needed(self) -> tuple[Unit, ...]:
+        """The units that are to be done before."""
+        return tuple(replace(self, method=method, needs=()) for method in self.needs)
 
     def __str__(self) -> str:
         variant = "" if self.variant.kind == "main" else f"{self.variant.name} "
@@ -115,8 +123,6 @@ class Store:
 
     def record(self, unit: Unit) -> Record:
         """What the metrics need of a unit that is done."""
-        from ctmap_gtsam.evaluation.record import Record
-
         return Record.load(self._file(unit, _RECORD))
 
     def settings(self, unit: Unit) -> Config:
@@ -137,8 +143,6 @@ class Store:
 
     def make_unit(self, unit: Unit, registry: Mapping[str, Method]) -> None:
         """Estimate and judge; an estimate that is there already is only judged."""
-        from ctmap_gtsam.evaluation.record import record
-
         run = load_run(self.run(unit.place))
         truth, identity = load_truth(run), self.identity(unit.place)
         assert truth is not None
@@ -164,7 +168,7 @@ class Store:
     ) -> dict[str, Any]:
         about: dict[str, Any] = {"key": key, "status": "ok", "reason": "", "seconds": 0.0, "estimate": None}
         began = time.perf_counter()
-        estimate, reason = _run_method(unit, seen_by(run, unit), truth, self.settings(unit), registry)
+        estimate, reason = self._run(unit, run, truth, registry)
         if reason is not None:
             return about | {"status": "skipped", "reason": reason}
         if estimate is not None:
@@ -174,6 +178,19 @@ class Store:
             # so that what took minutes is kept if judging it fails
             write_json(self._file(unit, ".json"), about)
         return about
+
+    def _run(
+        self, unit: Unit, run: Run, truth: Truth, registry: Mapping[str, Method]
+    ) -> tuple[Estimate | None, str | None]:
+        """The estimate, None for the detector's boxes; and the reason why there is neither."""
+        if unit.method == CEILING:
+            return truth_estimate(run, truth), None
+        method, seen = registry[unit.method], seen_by(run, unit)
+        obstacle = method.skip(seen)
+        if obstacle is not None or method.run is None:
+            return None, obstacle
+        needed = [Estimate.load(self._file(one, ".npz")) for one in unit.needed]
+        return method.run(seen, self.settings(unit), SILENT, *needed), None
 
     def _place(self, place: Place) -> Path:
         return self.root / "places" / f"{place.seed:06d}"
@@ -198,21 +215,6 @@ def seen_by(run: Run, unit: Unit) -> Run:
         for c, k in zip(classes, order, strict=True)
     )
     return replace(run, catalogue=Catalogue(changed))
-
-
-def _run_method(
-    unit: Unit, run: Run, truth: Truth, config: Config, registry: Mapping[str, Method]
-) -> tuple[Estimate | None, str | None]:
-    """The estimate, None for the detector's boxes; and the reason why there is neither."""
-    if unit.method == CEILING:
-        from ctmap_gtsam.evaluation import truth_estimate
-
-        return truth_estimate(run, truth), None
-    method = registry[unit.method]
-    obstacle = method.skip(run)
-    if obstacle is not None or method.run is None:
-        return None, obstacle
-    return method.run(run, config, SILENT), None
 
 
 def _read(path: Path) -> dict[str, Any]:
