@@ -262,15 +262,17 @@ def rug(low: Array, high: Array, rng: np.random.Generator) -> Parts:
         ((64, 92, 104), (212, 178, 110), (226, 216, 196)),
     ]
     ground, line, field = (np.array(c, dtype=np.float64) for c in palettes[int(rng.integers(3))])
-    nap = rng.standard_normal(4)
+    phase, striped = rng.uniform(0.0, 1.0, 2), bool(rng.random() < 0.5)
     n, m = (int(np.ceil(s / 0.03)) for s in size)
     top = sheet((low[0], low[1], 0.004), (size[0], 0.0, 0.0), (0.0, size[1], 0.0), n, m)
 
     def weave(v: Array) -> Array:
         inset = np.minimum(v[:, :2] - low, high - v[:, :2]).min(axis=1)
-        x, y = v[:, 0] - low[0] - size[0] / 2.0, v[:, 1] - low[1] - size[1] / 2.0
-        lozenge = np.abs(np.mod(x / 0.3 + nap[0], 1.0) - 0.5) + np.abs(np.mod(y / 0.3 + nap[1], 1.0) - 0.5)
-        colours = np.where((lozenge < 0.26)[:, None], line, np.where((lozenge > 0.74)[:, None], field, ground))
+        x, y = np.mod((v[:, :2] - low) / 0.3 + phase, 1.0).T
+        along = np.mod(x if size[0] > size[1] else y, 1.0)
+        lozenge = np.abs(x - 0.5) + np.abs(y - 0.5)
+        lines, others = (along < 0.2, (along > 0.5) & (along < 0.6)) if striped else (lozenge < 0.26, lozenge > 0.74)
+        colours = np.where(lines[:, None], line, np.where(others[:, None], field, ground))
         colours = np.where(((inset < 0.17) & (inset > 0.1))[:, None], field, colours)
         return np.where((inset < 0.1)[:, None], np.where((inset < 0.03)[:, None], ground * 0.8, ground), colours)
 

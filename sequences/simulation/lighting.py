@@ -276,6 +276,8 @@ def _incoming(point, normal, view, gloss, lights):
         off = SHADOW_OFFSET_M
         from_light = (off * normal[0] - towards[0], off * normal[1] - towards[1], off * normal[2] - towards[2])
         x, y, depth = _turned(lights.R_light_world[k], from_light)
+        if depth <= 0.0:  # behind the lamp's shade, or outdoors
+            continue
         if depth > 0.1:
             u = int(np.floor(lens[0] * x / depth + lens[2] + 0.5))
             v = int(np.floor(lens[1] * y / depth + lens[3] + 0.5))
@@ -285,7 +287,7 @@ def _incoming(point, normal, view, gloss, lights):
                     continue
         strength = lights.power[k] / square
         if lights.is_sky[k]:
-            strength *= max(depth, 0.0) / distance
+            strength *= depth / distance
             sky += strength * cosine
         else:
             lamp += strength * cosine
@@ -315,7 +317,7 @@ def _sample(u, v, z, f, gloss, lens, T, surface, lights):
     away = -1.0 / np.sqrt(_dot(ray, ray))
     view = (away * ray[0], away * ray[1], away * ray[2])
     lamp, sky, mirrored = _incoming(point, normal, view, gloss, lights)
-    even = AMBIENT * (0.72 + 0.28 * normal[2]) + lamp
+    even = AMBIENT * (0.78 + 0.22 * normal[2]) + lamp
     shine = 255.0 * MIRRORED * gloss * mirrored
     return (
         min(255.0, (even + DAYLIGHT[0] * sky) ** GAMMA * base[0] + shine),

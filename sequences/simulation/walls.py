@@ -18,6 +18,7 @@ Parts = list[tuple[Solid, Paint]]
 
 PLANK_M = (0.14, 1.3)
 GROUT_M = 0.004
+OVERLAP_M = 0.005  # of walls with floor, ceiling and each other, so that no light shows through
 RECESS_M = 0.12  # of windows and doors in the wall
 
 Opening = tuple[float, float, float, float]
@@ -73,7 +74,9 @@ def _lines(length: float, edges: Sequence[float], step: float) -> Array:
     even = np.linspace(0.0, length, int(np.ceil(length / step)) + 1)
     near = np.abs(even[:, None] - np.asarray([-1.0, *edges])).min(axis=1) < 0.02  # no slivers beside an edge
     near[[0, -1]] = False
-    return np.unique(np.concatenate([even[~near], np.clip(edges, 0.0, length)]))
+    lines = np.unique(np.concatenate([even[~near], np.clip(edges, 0.0, length)]))
+    lines[[0, -1]] += (-OVERLAP_M, OVERLAP_M)
+    return lines
 
 
 def _reveals(opening: Opening) -> Parts:
@@ -170,14 +173,20 @@ def carpet(size: Sequence[float], rng: np.random.Generator) -> Parts:
     colours = [(150, 140, 128), (112, 122, 136), (168, 156, 132), (126, 138, 122)]
     base = np.array(colours[int(rng.integers(len(colours)))], dtype=np.float64)
     n, m = (int(np.ceil(s / 0.05)) for s in size)
-    floor = sheet((0.0, 0.0, 0.0), (size[0], 0.0, 0.0), (0.0, size[1], 0.0), n, m)
+    floor = _spread(size, 0.0, n, m)
     mottle = 1.0 + 0.035 * rng.standard_normal(len(floor[0]))
     return [(floor, lambda _: base * mottle[:, None])]
 
 
 def _ground(size: Sequence[float], colour: ArrayLike) -> tuple[Solid, Paint]:
     """What shows between boards or tiles."""
-    return sheet((0.0, 0.0, -0.002), (size[0], 0.0, 0.0), (0.0, size[1], 0.0), 8, 8), plain(colour)
+    return _spread(size, -0.002, 8, 8), plain(colour)
+
+
+def _spread(size: Sequence[float], z: float, n: int, m: int) -> Solid:
+    """A level sheet over the floor and a little into the walls."""
+    width, depth = (s + 2.0 * OVERLAP_M for s in size)
+    return sheet((-OVERLAP_M, -OVERLAP_M, z), (width, 0.0, 0.0), (0.0, depth, 0.0), n, m)
 
 
 def papered(colour: ArrayLike, rng: np.random.Generator) -> Paint:

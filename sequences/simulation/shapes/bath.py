@@ -99,10 +99,9 @@ def soap() -> Mesh:
     inside = [[0.0635, 0.0437, 0.0215], [0.061, 0.0415, 0.02], [0.052, 0.034, 0.0115], [0.03, 0.02, 0.009]]
     dish = stacked([*under, *inside], power=2.6)
     levels = [[0.03, 0.019, 0.011], [0.037, 0.0245, 0.0155], [0.04, 0.027, 0.024], [0.0385, 0.0255, 0.034]]
-    bar = stacked([*levels, [0.035, 0.022, 0.0395], [0.02, 0.007, 0.042], [0.0199, 0.0069, 0.042]], power=3.0)
-    cream, ridge, grey = (236, 222, 176), (212, 194, 142), (150, 176, 184)
-    name = within(x=(-0.01995, 0.01995), y=(-0.00695, 0.00695), z=(0.03, 1.0))
-    return assemble([(dish, plain(grey)), (bar, printed(cream, (name, ridge)))])
+    bar = stacked([*levels, [0.035, 0.022, 0.0395], [0.02, 0.01, 0.042]], power=3.0)
+    cream, grey = (236, 222, 176), (150, 176, 184)
+    return assemble([(dish, plain(grey)), (bar, plain(cream))])
 
 
 def toilet_roll() -> Mesh:
