@@ -53,7 +53,7 @@ def render(
     """
     shown = shown_methods(outcomes)
     agreement = comparison.agreement.get(shown[0]) if len(shown) > 1 else None
-    columns = tables.known_columns(comparison)
+    columns, more = (tables.known_columns(comparison, some) for some in (tables.COLUMNS, tables.MORE_COLUMNS))
     environment = Environment(
         loader=PackageLoader("ctmap_gtsam.reporting"),
         autoescape=True,
@@ -68,6 +68,8 @@ def render(
         has_truth=comparison.truth is not None,
         columns=columns,
         method_rows=tables.method_rows(comparison, outcomes, columns),
+        more_columns=more,
+        more_rows=tables.more_rows(comparison, outcomes, more) if more else [],
         oracles=[name for name, outcome in outcomes.items() if outcome.reads_truth and outcome.status == "ok"],
         shown=shown,
         pictures=_pictures(run, outcomes, shown, telling_frames(comparison, agreement)),

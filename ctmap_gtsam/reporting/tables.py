@@ -43,12 +43,35 @@ COLUMNS = (
     Column("adds_mm_median", "ADD-S", "mm", ".1f", "low", "mean distance to the nearest surface point; median"),
     Column("translation_mm_median", "position", "mm", ".1f", "low", "between the boxes' centres; median"),
     Column("rotation_deg_median", "rotation", "°", ".1f", "low", "angle, up to symmetry; median"),
+    Column("map_50", "mAP", "%", ".1f", "high", "mean average precision of each frame's boxes, IoU 0.5", 100),
+    Column(
+        "map_50_paper", "mAP, end", "%", ".1f", "high", "the same of each visit's last map, in all of its frames", 100
+    ),
     Column("missed_objects", "missed", "", "d", "low", "true objects without a match"),
     Column("false_positive_objects", "false", "", "d", "low", "objects that match nothing true"),
     Column("existing_objects_final", "at end", "", "d", "", "objects in the last map"),
     Column("hypotheses_scored", "hypotheses", "", ",d", "", "poses rendered and scored against depth"),
 )
+"""What a comparison is told by"""
+
 OBJECT_COLUMNS = COLUMNS[:6]
+
+MORE_COLUMNS = (
+    Column("pose_2cm_10deg", "2 cm, 10°", "%", ".1f", "high", "share of object-frames posed within both", 100),
+    Column("pose_5cm_15deg", "5 cm, 15°", "%", ".1f", "high", "the same", 100),
+    Column("last_seen_2cm_10deg", "end, 2 cm", "%", ".1f", "high",
+           "the same of each visit's last map, where each object was last seen", 100),
+    Column("last_seen_5cm_15deg", "end, 5 cm", "%", ".1f", "high", "the same within 5 cm and 15°", 100),
+    Column("adds_auc", "AUC", "%", ".1f", "high", "area under the curve of ADD-S up to 10 cm", 100),
+    Column("bop_recall", "BOP", "%", ".1f", "high", "mean of BOP's average recalls of VSD, MSSD and MSPD", 100),
+    Column("ate_mm", "ATE", "mm", ".1f", "low", "root mean square error of the camera's positions"),
+    Column("identity_switches", "switches", "", "d", "low", "true objects that become another object of the map"),
+    Column("moves_recall", "moves", "%", ".0f", "high", "share of the moves between visits that were found", 100),
+    Column("false_moves", "false moves", "", "d", "low", "moves claimed of what stayed"),
+    Column("coverage_95", "coverage", "%", ".0f", "", "share of true poses in the regions that should hold 95 %", 100),
+    Column("class_log_score", "log score", "nats", ".2f", "low", "-log P of the true class; mean"),
+)  # fmt: skip
+"""What else a method is judged by"""
 
 
 @dataclass(frozen=True)
@@ -69,25 +92,39 @@ class Row:
     """why there are no cells"""
 
 
-def known_columns(comparison: Comparison) -> list[Column]:
-    """Those of COLUMNS in which any method has a figure."""
+def known_columns(comparison: Comparison, columns: Sequence[Column] = COLUMNS) -> list[Column]:
+    """Those of some columns in which any method has a figure."""
     metrics = [score.metrics for score in comparison.methods.values()]
-    return [column for column in COLUMNS if any(m.get(column.key) is not None for m in metrics)]
+    return [column for column in columns if any(m.get(column.key) is not None for m in metrics)]
 
 
 def method_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: Sequence[Column]) -> list[Row]:
     """One row a method: the columns, then seconds; the best of those with poses marked, oracles left aside."""
-    competing = {name for name, o in outcomes.items() if o.estimate is not None and not o.reads_truth}
-    posed = [score.metrics for name, score in comparison.methods.items() if name in competing]
     rows = []
     for name, outcome in outcomes.items():
         if outcome.status == "skipped":
             rows.append(Row(name, (), f"skipped: {outcome.reason} {outcome.remedy}".strip()))
             continue
-        rivals = posed if name in competing else []
         seconds = Cell(NOTHING if outcome.seconds is None else f"{outcome.seconds:.1f}")
-        rows.append(Row(name, [*_cells(columns, comparison.methods[name].metrics, rivals), seconds]))
+        rows.append(Row(name, [*_method_cells(comparison, outcomes, name, columns), seconds]))
     return rows
+
+
+def more_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: Sequence[Column]) -> list[Row]:
+    """One row a method that ran: the columns, marked as in `method_rows`."""
+    return [
+        Row(name, _method_cells(comparison, outcomes, name, columns))
+        for name, outcome in outcomes.items()
+        if outcome.status == "ok"
+    ]
+
+
+def _method_cells(
+    comparison: Comparison, outcomes: Mapping[str, Outcome], name: str, columns: Sequence[Column]
+) -> list[Cell]:
+    competing = [n for n, o in outcomes.items() if o.estimate is not None and not o.reads_truth]
+    rivals = [comparison.methods[n].metrics for n in competing] if name in competing else []
+    return _cells(columns, comparison.methods[name].metrics, rivals)
 
 
 def object_rows(comparison: Comparison, methods: Sequence[str]) -> list[tuple[str, list[Row]]]:

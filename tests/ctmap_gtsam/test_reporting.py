@@ -91,6 +91,20 @@ def test_the_page_says_what_was_compared(page):
     assert "smooth-ct calls objects what they are in 100 % of the views" in text
 
 
+def test_the_second_table_has_a_row_for_all_that_ran(small, outcomes, page):
+    comparison = compare(small[0], {n: o.estimate for n, o in outcomes.items() if o.estimate is not None})
+    columns = tables.known_columns(comparison, tables.MORE_COLUMNS)
+    rows = {row.name: row.cells for row in tables.more_rows(comparison, outcomes, columns)}
+    assert list(rows) == ["detector", "filter-ct", "smooth-ct"]
+    auc = [c.key for c in columns].index("adds_auc")
+    assert rows["smooth-ct"][auc] == tables.Cell("100.0", best=True)
+    assert not rows["filter-ct"][auc].best
+    assert rows["detector"][auc].text == tables.NOTHING
+    assert rows["detector"][-1].text != tables.NOTHING  # a log score it has
+    assert all(f"<b>{column.title}</b>" in page for column in columns)
+    assert "moves_recall" not in [c.key for c in columns]  # nothing was moved
+
+
 def test_the_same_comparison_gives_the_same_page(small, outcomes, page):
     assert page_of(small[0], outcomes) == page
 
