@@ -100,8 +100,8 @@ def furnish(config: PlaceConfig, seed: int) -> Place:
     spots = tuple(spot for k, piece in enumerate(furniture) for spot in _spots(k, piece))
     categories = sorted({s.object_class.category for s in small})
     homes = dict(zip(categories, (int(k) for k in rng.permutation(len(spots))), strict=False))
-    used = {s.object_class.obj_id for s in (*stock, *distractors)}
-    shapes = tuple(s for s in household() if s.object_class.obj_id in used or not s.object_class.movable)
+    used = {s.object_class.obj_id for s in (*stock, *distractors, *(p.shape for p in furniture))}
+    shapes = tuple(s for s in household() if s.object_class.obj_id in used)
     room = room_mesh(side, furniture[0].T_world_object[:3, 3], generator(seed, "simulation.room"))
     return Place(shapes, stock, furniture, spots, homes, room, side)
 
