@@ -37,6 +37,8 @@ _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
 """steps at which the score's shape is probed, metres at the object's radius"""
 _CLIMBS, _CLIMB_NATS = 6, 0.05  # at most so many moves on the score, each gaining at least this much
 _SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
+_UNLIKE = 0.4  # sizes of which one is less than this share of the other don't belong together
+_LITTLE, _FURNITURE = 0.25, 2.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
@@ -159,6 +161,7 @@ class Proposer:
             share: of the configured effort.
         """
         view = view.coarse()
+        share *= self._worth(shape, view, observation)
         drawn = self._draw(
             shape, view, observation, surroundings, rng, max(8, round(share * self.settings.fresh_poses))
         )
@@ -212,6 +215,22 @@ class Proposer:
         box = np.array(view.detection.box)
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
+
+    def _worth(self, shape: Shape, view: View, observation: Observation) -> float:
+        """Effort for a class by its size: more for furniture, little for what could hardly look so large or so small.
+
+        Something much smaller than its class would be seen may be hidden but for a part, so it is searched for, too.
+        """
+        assert view.detection is not None
+        box = np.array(view.detection.box)
+        z = centre_depth(observation.depth, box)
+        if z == 0.0:
+            return 1.0
+        seen_m = float(np.hypot(*box[2:])) * z / observation.frame.camera.fx
+        sides = np.sort(np.ptp(shape.mesh.vertices, axis=0))
+        if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
+            return _LITTLE
+        return _FURNITURE if shape.reach_m > _SMALL_REACH_M else 1.0
 
     def _draw(
         self,
