@@ -1,4 +1,4 @@
-"""Measurements of speed, by name: each is a module with `run(config, progress) -> {"<method>.<figure>": value}`."""
+"""Measurements, by name: each is a module with `run(config, progress, ...) -> {"<method>.<figure>": value}`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from ctmap_gtsam.runtime.versions import versions
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
 
-BENCHES = {"render": "ctmap_gtsam.bench.render"}
+BENCHES = {"realism": "ctmap_gtsam.bench.realism", "render": "ctmap_gtsam.bench.render"}
 """Name -> module"""
 
 
-def run_bench(name: str, config: Config, progress: Progress = SILENT) -> dict[str, Any]:
+def run_bench(name: str, config: Config, progress: Progress = SILENT, **options: Any) -> dict[str, Any]:
     """Measure once.
+
+    Args:
+        name: of the measurement.
+        config: settings.
+        progress: is told how far it is.
+        options: of that measurement.
 
     Returns:
         {"schema": 1, "name", "figures": {"<method>.<figure>": value}, "seconds", "versions"}
@@ -27,6 +33,6 @@ def run_bench(name: str, config: Config, progress: Progress = SILENT) -> dict[st
     if name not in BENCHES:
         raise InputError(f"no measurement is called {name!r}", remedy=f"choose one of {', '.join(sorted(BENCHES))}")
     began = time.perf_counter()
-    figures = import_module(BENCHES[name]).run(config, progress)
+    figures = import_module(BENCHES[name]).run(config, progress, **options)
     seconds = time.perf_counter() - began
     return {"schema": 1, "name": name, "figures": figures, "seconds": seconds, "versions": versions()}

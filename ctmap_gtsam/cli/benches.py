@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -90,8 +90,35 @@ def paper(
         raise typer.Exit(EXIT_FAILED)
 
 
+@bench_app.command()
+def realism(
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="DIR", envvar="CTMAP_DATA", help="Folder of the real recordings."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for plots and pictures.")] = None,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Depth about the true surface: real recordings beside their synthetic twins and simulated places.
+
+    Spread, tails, correlation over pixels, holes and bias. `over_real` above 1: simulated depth is the harder.
+
+    Example: `ctmap bench realism --data recordings --out realism --json realism.json`
+    """
+    folder = None if out is None else writable(out)
+    _figures("realism", json_file, config_file, assignments, seed, data=data, out=folder)
+
+
 def _figures(
-    name: str, json_file: Path | None, config_file: Path | None, assignments: list[str] | None, seed: int | None
+    name: str,
+    json_file: Path | None,
+    config_file: Path | None,
+    assignments: list[str] | None,
+    seed: int | None,
+    **options: Any,
 ) -> None:
     """Measure, print the figures and write them."""
     from ctmap_gtsam.bench import run_bench
@@ -99,7 +126,7 @@ def _figures(
     from sequences.atomic import write_json
 
     with RichProgress() as progress:
-        result = run_bench(name, settings(config_file, assignments, seed), progress)
+        result = run_bench(name, settings(config_file, assignments, seed), progress, **options)
     for figure, value in result["figures"].items():
         typer.echo(f"{figure} {value:.6g}" if isinstance(value, float) else f"{figure} {value}")
     if json_file is not None:
