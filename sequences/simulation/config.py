@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from sequences.camera import Camera
 from sequences.options import option
@@ -16,34 +17,58 @@ FOCAL_PX = 570.3422  # of the PrimeSense Carmine and Asus Xtion as OpenNI states
 class PlaceConfig:
     """What is in the place."""
 
-    objects: int = option(10, "small things in the place; classes repeat once all have been used", low=1, high=40)
-    distractors: int = option(2, "classes in the catalogue of which the place has none", low=0)
-    known_furniture: bool = option(
-        True, "whether table and shelf are objects of the catalogue, or surfaces nobody modelled"
+    kind: Literal["any", "kitchen", "living room", "bathroom", "study", "workroom", "mixed"] = option(
+        "any", "of room, which says what furniture stands there and what is kept there"
     )
+    objects: int = option(10, "small things that belong in the place", low=1, high=40)
+    twins: int = option(1, "of these, how many are of the same class as another", low=0, high=20)
+    distractors: int = option(3, "classes in the catalogue of which the place has none", low=0)
+    clutter: int = option(
+        3, "things about which nobody modelled: they are in no catalogue and no truth", low=0, high=20
+    )
+    known_furniture: bool = option(True, "whether furniture is in the catalogue, or surfaces that nobody modelled")
     together: float = option(0.75, "probability that a thing stands where its category has its spot", low=0.0, high=1.0)
+    cloth: float = option(0.1, "probability that a piece of furniture wears a cloth in a visit", low=0.0, high=1.0)
     clearance_m: float = option(0.012, "least gap between the outlines of two things on one surface, metres", low=0.0)
 
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """The visits and what changes between them."""
+    """The visits and what changes between them and in them."""
 
     visits: int = option(2, "recordings of the place", low=1, high=4)
-    gap_h: float = option(4.0, "hours from one visit to the next", low=0.05)
-    moves: int = option(1, "things taken to another surface between two visits, as far as they fit", low=0)
+    gap_h: float | None = option(
+        None, "hours from the end of a visit to the next one's start; without it each gap is drawn", low=0.01
+    )
+    shortest_gap_h: float = option(0.1, "least gap that is drawn, hours; its logarithm is uniform", low=0.01)
+    longest_gap_h: float = option(72.0, "greatest gap that is drawn, hours", low=0.01)
+    moves: int | None = option(
+        None,
+        "things taken to another piece of furniture between two visits, as far as they fit; without it each thing "
+        "stays or moves by its own persistence",
+        low=0,
+    )
+    away: float = option(
+        0.1, "share of the moves without such a number that take a thing out of the place", low=0.0, high=0.9
+    )
+    swap_twins: float = option(
+        0.0, "probability that two things of one class take each other's place between two visits", low=0.0, high=1.0
+    )
+    nudges: int = option(0, "things pushed a little in view of the camera in each visit", low=0, high=10)
+
+    def __post_init__(self) -> None:
+        if self.shortest_gap_h > self.longest_gap_h:
+            raise ValueError("shortest_gap_h is above longest_gap_h")
 
 
 @dataclass(frozen=True)
 class TrajectoryConfig:
-    """The camera's path in each visit."""
+    """The camera's path in each visit: a robot drives past the furniture and looks from one piece to the next."""
 
     frames: int = option(26, "images of each visit", low=1)
     period_s: float = option(0.5, "seconds between two images", low=0.001)
     height_m: float = option(1.2, "of the camera above the floor, a head's; metres", low=0.9, high=1.6)
-    radius_m: float = option(1.1, "of the arc about the table's middle, metres", low=0.8, high=2.0)
-    arc_deg: float = option(55.0, "the arc's length, degrees", low=0.0, high=80.0)
-    pan: float = option(1.0, "how far the head turns from the table to the shelf", low=0.0, high=1.0)
+    distance_m: float = option(1.45, "from the camera to what it looks at, more or less; metres", low=0.8, high=1.8)
 
 
 @dataclass(frozen=True)
@@ -99,7 +124,7 @@ class DetectorConfig:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """A simulated run: a corner of a room with a table, a shelf and small things, visited a few times."""
+    """A simulated run: a room with furniture and small things, visited a few times."""
 
     place: PlaceConfig = field(default_factory=PlaceConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)

@@ -13,8 +13,8 @@ from sequences.simulation import (
 )
 
 TINY = SimulationConfig(
-    place=PlaceConfig(objects=4, distractors=1),
-    motion=MotionConfig(visits=2, moves=1),
+    place=PlaceConfig(objects=4, twins=1, distractors=1, clutter=2, cloth=0.0),
+    motion=MotionConfig(visits=2, moves=1, gap_h=4.0, nudges=1),
     trajectory=TrajectoryConfig(frames=6),
     sensor=SensorConfig(width=320, antialias=1),
 )
@@ -22,7 +22,7 @@ TINY = SimulationConfig(
 
 @pytest.fixture(scope="session")
 def tiny() -> SimulationConfig:
-    """Two visits of six frames of 320 x 240 pixels, four things."""
+    """Two visits of six frames of 320 x 240 pixels, four things, one nudged in each visit."""
     return TINY
 
 
