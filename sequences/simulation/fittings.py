@@ -206,7 +206,7 @@ def switch(x: float, z: float) -> Parts:
 
 
 def plant(rng: np.random.Generator) -> Parts:
-    """A pot on the floor with long leaves, 0.9 to 1.2 m high and 0.45 m wide, about the origin."""
+    """A pot on the floor with long leaves, 0.9 to 1.2 m high and 0.4 m wide, about the origin."""
     profile = [[0.0, 0.0], [0.10, 0.0], [0.14, 0.24], [0.145, 0.28], [0.13, 0.28], [0.125, 0.25], [0.0, 0.25]]
     glaze = [(176, 98, 66), (214, 212, 206), (70, 92, 110)][int(rng.integers(3))]
 
@@ -215,7 +215,7 @@ def plant(rng: np.random.Generator) -> Parts:
 
     parts: Parts = [(lathe(profile, 24), printed(glaze, (soil, (84, 62, 46))))]
     for k in range(13):
-        turn, reach, rise = 2.4 * k + rng.uniform(-0.3, 0.3), rng.uniform(0.1, 0.2), rng.uniform(0.5, 0.95)
+        turn, reach, rise = 2.4 * k + rng.uniform(-0.3, 0.3), rng.uniform(0.08, 0.16), rng.uniform(0.5, 0.95)
         s = np.linspace(0.0, 1.0, 7)
         out = 0.03 + reach * s**2
         leaf = np.stack([out * np.cos(turn), out * np.sin(turn), 0.25 + rise * (s - 0.25 * s**3)], axis=-1)
@@ -231,10 +231,10 @@ def floor_lamp() -> Parts:
     parts: Parts = []
     for k in range(3):
         c, s = np.cos(2.094 * k + 0.5), np.sin(2.094 * k + 0.5)
-        leg = np.array([[0.22 * c, 0.22 * s, 0.0], [0.12 * c, 0.12 * s, 0.6], [0.02 * c, 0.02 * s, 1.2]])
+        leg = np.array([[0.18 * c, 0.18 * s, 0.0], [0.1 * c, 0.1 * s, 0.6], [0.02 * c, 0.02 * s, 1.2]])
         parts.append((tube(leg, 0.011, 8), wood))
     stem = np.array([[0.0, 0.0, z] for z in (1.18, 1.25, 1.35)])
-    hood = [[0.2, 1.25], [0.203, 1.25], [0.143, 1.55], [0.14, 1.55]]
+    hood = [[0.187, 1.25], [0.19, 1.25], [0.133, 1.55], [0.13, 1.55]]
     return [*parts, (tube(stem, 0.014, 8), wood), (ring(hood, 32), shade)]
 
 

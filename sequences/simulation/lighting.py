@@ -35,6 +35,7 @@ AMBIENT, LAMP, SKY = 0.42, 0.95, 0.7
 OUTDOORS = 1.1  # light on what lies beyond the window
 DAYLIGHT = (0.95, 1.0, 1.08)  # its colour against the lamp's
 MIRRORED, SHARPNESS = 0.9, 60.0  # strength and exponent of highlights
+SHADE = 0.3  # cosine from the plumb line beyond which the lamp's shade dims it
 GAMMA = 1.0 / 2.2
 
 
@@ -73,7 +74,7 @@ class Lights(NamedTuple):
     R_light_world: Array
     """(L, 3, 3) z is the way each looks"""
     power: Array
-    """(L,) all equal from all sides for the lamp, by the cosine for the window"""
+    """(L,) the lamp's is alike all round below it, the window's goes by the cosine"""
     is_sky: NDArray[np.bool_]
     """(L,)"""
     shadow_maps: NDArray[np.float32]
@@ -290,6 +291,7 @@ def _incoming(point, normal, view, gloss, lights):
             strength *= depth / distance
             sky += strength * cosine
         else:
+            strength *= min(1.0, depth / distance / SHADE)
             lamp += strength * cosine
         if gloss > 0.0:
             half = (towards[0] / distance + view[0], towards[1] / distance + view[1], towards[2] / distance + view[2])
@@ -317,7 +319,7 @@ def _sample(u, v, z, f, gloss, lens, T, surface, lights):
     away = -1.0 / np.sqrt(_dot(ray, ray))
     view = (away * ray[0], away * ray[1], away * ray[2])
     lamp, sky, mirrored = _incoming(point, normal, view, gloss, lights)
-    even = AMBIENT * (0.78 + 0.22 * normal[2]) + lamp
+    even = AMBIENT * (0.84 + 0.16 * normal[2]) + lamp
     shine = 255.0 * MIRRORED * gloss * mirrored
     return (
         min(255.0, (even + DAYLIGHT[0] * sky) ** GAMMA * base[0] + shine),

@@ -99,7 +99,7 @@ class Place:
     def room(self) -> Room:
         """Floor, walls and what hangs on them."""
         boxes = np.stack([_box(piece) for piece in self.furniture])
-        return room(tuple(self.layout.size), boxes, generator(self.seed, "simulation.room"))
+        return room(tuple(self.layout.size), boxes, generator(self.seed, "simulation.room"), self.kind)
 
     @cached_property
     def odds(self) -> Array:

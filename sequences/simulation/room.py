@@ -5,7 +5,7 @@ The room's frame: the origin is a corner on the floor, x and y run along two wal
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +15,7 @@ from sequences import se3
 from sequences.catalogue import Mesh
 from sequences.simulation import fittings, solids
 from sequences.simulation.lighting import Window
-from sequences.simulation.solids import Paint, baked, moved, plain, rotation
+from sequences.simulation.solids import baked, moved, plain, rotation
 from sequences.simulation.walls import (
     RECESS_M,
     Opening,
@@ -37,13 +37,36 @@ HEIGHT_M = 2.6
 BEFORE_WALL_M = 0.5  # what is nearer to a wall than this stands before it
 DOOR_M = (0.86, 2.05)
 DOOR_CLEAR_M = 1.0  # free floor before a door
+OFF_WALL_M = 0.025  # where there is skirting
 STEP_M = 0.05  # between the places tried for a fitting
+TILED_M = 1.35  # height of a wall's tiles
 GAP_M = 0.08  # between fittings, and between what stands on the floor
-FLOORS = (boards, boards, tiles, carpet)
 TINTS = ((228, 222, 210), (204, 214, 206), (206, 212, 218), (226, 208, 186), (216, 218, 222), (196, 204, 190))
 ACCENTS = ((150, 172, 160), (140, 158, 178), (196, 150, 120), (176, 166, 190), (206, 184, 130))
 CURTAINS = ((232, 226, 212), (134, 152, 168), (196, 110, 88), (168, 178, 140), (214, 190, 120))
 DOORS = ((236, 234, 228), (176, 130, 86), (206, 200, 188))
+
+
+@dataclass(frozen=True)
+class Style:
+    """What is usual in a kind of room."""
+
+    floors: tuple[Callable[[Sequence[float], np.random.Generator], Parts], ...]
+    """drawn from evenly"""
+    finish: tuple[str, ...]
+    """of the one wall that differs from the others, drawn from evenly: papered, tinted or tiled"""
+    rug: float
+    """probability that one is laid where there is space"""
+
+
+STYLES: Mapping[str, Style] = {
+    "kitchen": Style((tiles, tiles, boards), ("tiled", "tiled", "tinted"), 0.2),
+    "living room": Style((boards, boards, carpet), ("papered", "tinted"), 0.9),
+    "bathroom": Style((tiles,), ("tiled",), 0.3),
+    "study": Style((boards, carpet), ("papered", "tinted"), 0.6),
+    "workroom": Style((tiles, boards), ("tinted",), 0.0),
+}
+ANY = Style((boards, boards, tiles, carpet), ("papered", "tinted", "tiled"), 0.8)
 
 
 @dataclass(frozen=True)
@@ -88,7 +111,7 @@ class _Wall:
         self.taken.append((left - margin, right + margin, low - margin, high + margin))
 
 
-def room(size: Sequence[float], boxes: Array, rng: np.random.Generator) -> Room:
+def room(size: Sequence[float], boxes: Array, rng: np.random.Generator, kind: str = "mixed") -> Room:
     """A room that somebody lives in.
 
     What it adds keeps clear of what stands in it: a window comes only over low furniture, a door only where one can
@@ -99,15 +122,17 @@ def room(size: Sequence[float], boxes: Array, rng: np.random.Generator) -> Room:
         boxes: (n, 2, 3) least and greatest corner of each piece of furniture, and of any other space to be kept clear,
             metres, the room's frame.
         rng: draws all of it.
+        kind: one of STYLES; anything goes in a room of another kind.
     """
+    style = STYLES.get(kind, ANY)
     boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 2, 3)
     walls = _walls(np.asarray(size, dtype=np.float64), boxes)
     in_any_order = [walls[int(k)] for k in rng.permutation(4)]
     door_floor = _add_door(in_any_order, rng)
     window = _add_window(in_any_order[::-1], rng)
     _hang_pictures(in_any_order, rng)
-    _paint_walls(walls, rng)
-    floor: Parts = FLOORS[int(rng.integers(len(FLOORS)))](size, rng)
+    _paint_walls(walls, style, rng)
+    floor = style.floors[int(rng.integers(len(style.floors)))](size, rng)
     ceiling = sheet((0.0, 0.0, HEIGHT_M), (0.0, size[1], 0.0), (size[0], 0.0, 0.0), 8, 8)
     kept_clear = [*(b[:, :2] for b in boxes), *door_floor]
     parts: Parts = [
@@ -115,8 +140,9 @@ def room(size: Sequence[float], boxes: Array, rng: np.random.Generator) -> Room:
         (ceiling, plain((246, 245, 242))),
         *(part for w in walls for part in _put(w.parts, w.T_room_wall)),
         *_stand_about(walls, kept_clear, rng),
-        *_lay_rug(np.asarray(size, dtype=np.float64), kept_clear, rng),
     ]
+    if rng.random() < style.rug:
+        parts += _lay_rug(np.asarray(size, dtype=np.float64), kept_clear, rng)
     return Room(solids.join(parts), window)
 
 
@@ -192,38 +218,37 @@ def _hang_pictures(walls: Sequence[_Wall], rng: np.random.Generator) -> None:
                 w.parts += fittings.picture((place[0] + place[1]) / 2.0, z, (wide, tall), rng)
 
 
-def _paint_walls(walls: Sequence[_Wall], rng: np.random.Generator) -> None:
-    """One tint all round; one wall is papered, tiled or of another colour."""
-    tint = TINTS[int(rng.integers(len(TINTS)))]
-    accent, special = ACCENTS[int(rng.integers(len(ACCENTS)))], int(rng.integers(4))
-    kind = int(rng.integers(3))
+def _paint_walls(walls: Sequence[_Wall], style: Style, rng: np.random.Generator) -> None:
+    """One tint all round, but for one wall of the style's finish; where nothing but tiles is usual, all are tiled."""
+    tint, accent = TINTS[int(rng.integers(len(TINTS)))], ACCENTS[int(rng.integers(len(ACCENTS)))]
+    finish, special = style.finish[int(rng.integers(len(style.finish)))], int(rng.integers(4))
     for k, w in enumerate(walls):
-        paint: Paint = faded(tint, rng)
-        if k == special:
-            paint = papered(accent, rng) if kind == 0 else faded(accent if kind == 1 else tint, rng)
-        doors = [o for o in w.openings if o[2] == 0.0]
-        w.parts += wall(w.length, HEIGHT_M, w.openings, paint, step=0.05 if (k, kind) == (special, 0) else 0.3)
-        w.parts += skirting(w.length, doors)
-        if (k, kind) == (special, 2):
-            w.parts += wall_tiles(w.length, 1.35, [(o[0] - 0.08, o[1] + 0.08, *o[2:]) for o in w.openings], accent, rng)
+        here = finish if k == special or style.finish == ("tiled",) else "plain"
+        paints = {"papered": papered(accent, rng), "tinted": faded(accent, rng)}
+        step = 0.05 if here == "papered" else 0.3
+        w.parts += wall(w.length, HEIGHT_M, w.openings, paints.get(here, faded(tint, rng)), step)
+        w.parts += skirting(w.length, [o for o in w.openings if o[2] == 0.0])
+        if here == "tiled":
+            framed = [(o[0] - 0.08, o[1] + 0.08, *o[2:]) for o in w.openings]
+            w.parts += wall_tiles(w.length, TILED_M, framed, accent, rng)
 
 
 def _stand_about(walls: Sequence[_Wall], kept_clear: Sequence[Array], rng: np.random.Generator) -> Parts:
     """A plant, a lamp and one or two baskets on free floor along the walls."""
     parts, blocked = [], [*kept_clear]
-    wanted = [(0.46, fittings.plant(rng)), (0.5, fittings.floor_lamp()), (0.44, fittings.floor_basket(rng))]
+    wanted = [(0.41, fittings.plant(rng)), (0.4, fittings.floor_lamp()), (0.44, fittings.floor_basket(rng))]
     for width, thing in wanted[: 2 + int(rng.integers(2))]:
         places = [(w, x) for w in walls for x in np.arange(width / 2.0 + 0.05, w.length - width / 2.0 - 0.05, 0.1)]
         # corners first, as people do
         distance = [min(x, w.length - x) + rng.uniform(0.0, 0.6) for w, x in places]
         for k in np.argsort(distance):
             w, x = places[int(k)]
-            (at,) = se3.transform(w.T_room_wall, np.array([[x, -width / 2.0 - 0.06, 0.0]]))
+            (at,) = se3.transform(w.T_room_wall, np.array([[x, -width / 2.0 - OFF_WALL_M, 0.0]]))
             square = np.stack([at[:2] - width / 2.0, at[:2] + width / 2.0])
             hung = [t for t in w.taken if t[2] < 1.6 and t[1] > x - width / 2.0 and t[0] < x + width / 2.0]
             if not hung and not any(_overlap(square, b) for b in blocked):
                 blocked.append(square)
-                turn = rotation("z", float(rng.uniform(0.0, 360.0)) if width > 0.45 else float(rng.uniform(-8.0, 8.0)))
+                turn = w.T_room_wall[:3, :3] @ rotation("z", float(rng.uniform(-6.0, 6.0)))
                 parts += _put(thing, se3.make(turn, at))
                 break
     return parts
@@ -248,18 +273,3 @@ def _lay_rug(size: Array, kept_clear: Sequence[Array], rng: np.random.Generator)
         if best is None or np.prod(extent) > np.prod(best[1] - best[0]):
             best = field_
     return [] if best is None else fittings.rug(best[0], best[1], rng)
-
-
-def room_mesh(side: int, table_at: Array, rng: np.random.Generator) -> Mesh:
-    """A room of 4.2 x 4.2 m whose corner between the table's wall y = 0 and the shelf's wall x = 0 is the origin.
-
-    Args:
-        side: sign of x inside the room; y < 0 there.
-        table_at: (3,) centre of the table, world frame.
-        rng: draws all of it.
-    """
-    corner = np.array([min(0.0, side * 4.2), -4.2, 0.0])
-    table = np.array([[table_at[0] - 0.65, -0.75, 0.0], [table_at[0] + 0.65, 0.0, 0.75]])
-    shelf = np.sort(np.array([[0.0, -2.1, 0.0], [side * 0.4, -0.7, 1.5]]), axis=0)
-    made = room((4.2, 4.2), np.stack([table, shelf]) - corner, rng).mesh
-    return Mesh(made.vertices + corner, made.faces, made.colours)

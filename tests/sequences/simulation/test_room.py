@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from sequences import se3
 from sequences.camera import Camera
 from sequences.rendering.scene import render_scene
-from sequences.simulation.room import HEIGHT_M, Room, room
+from sequences.simulation.room import HEIGHT_M, STYLES, Room, room
 from sequences.simulation.solids import rotation
 
 SIZE = np.array([4.4, 3.8])
@@ -36,7 +36,7 @@ seeds = st.integers(0, 10**6)
 
 
 def made(some: np.ndarray, seed: int) -> Room:
-    return room(SIZE, some, np.random.default_rng(seed))
+    return room(SIZE, some, np.random.default_rng(seed), kind=(*STYLES, "mixed")[seed % (1 + len(STYLES))])
 
 
 @settings(max_examples=15)
@@ -101,3 +101,11 @@ def test_sizes_are_as_asked(size):
     assert (np.abs(low[:2]) < 0.15).all()
     assert (np.abs(high[:2] - size) < 0.15).all()
     assert high[2] == pytest.approx(HEIGHT_M, abs=0.01)
+
+
+@settings(max_examples=15, phases=[Phase.generate])
+@given(some=boxes, seed=seeds)
+def test_the_middle_of_the_floor_is_free_for_a_robot(some, seed):
+    vertices = made(some, seed).mesh.vertices
+    inside = ((vertices[:, :2] > 0.47) & (vertices[:, :2] < SIZE - 0.47)).all(axis=1)
+    assert vertices[inside & (vertices[:, 2] < 2.0), 2].max(initial=0.0) < 0.005  # a rug
