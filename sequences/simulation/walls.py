@@ -7,6 +7,7 @@ y into it. So the wall is the plane y = 0, the room where y < 0, as furniture ha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 Parts = list[tuple[Solid, Paint]]
 
 PLANK_M = (0.14, 1.3)
+TILE_M = 0.15  # of walls
 GROUT_M = 0.004
 OVERLAP_M = 0.005  # of walls with floor, ceiling and each other, so that no light shows through
 RECESS_M = 0.12  # of windows and doors in the wall
@@ -107,16 +109,19 @@ def faded(colour: ArrayLike, rng: np.random.Generator) -> Paint:
 def wall_tiles(
     length: float, top: float, openings: Sequence[Opening], colour: ArrayLike, rng: np.random.Generator
 ) -> Parts:
-    """Tiles of 0.15 m on the lower part of a wall, 4 mm before it, left out where an opening is."""
-    tile, parts = 0.15, []
-    for i in range(int(length / tile)):
-        for j in range(int(top / tile)):
-            x, z = i * tile, j * tile
-            if any(x + tile > o[0] and x < o[1] and z + tile > o[2] and z < o[3] for o in openings):
+    """Tiles of 0.15 m on the lower part of a wall, 4 mm before it, cut to fit its corners and openings."""
+    x, z = (np.append(np.arange(0.0, end - 0.02, TILE_M), end) for end in (length, top))
+    x = np.unique(np.append(x, [np.clip(e, 0.0, length) for o in openings for e in o[:2]]))
+    z = np.unique(np.append(z, [e for o in openings for e in o[2:] if e < top]))
+    parts: Parts = []
+    for left, right in pairwise(x):
+        for low, high in pairwise(z):
+            w, h = right - left - GROUT_M, high - low - GROUT_M
+            middle = (left + right) / 2.0, (low + high) / 2.0
+            if min(w, h) <= 0.0 or any(o[0] < middle[0] < o[1] and o[2] < middle[1] < o[3] for o in openings):
                 continue
             shade = np.asarray(colour) * (1.0 + 0.025 * rng.standard_normal())
-            side = tile - GROUT_M
-            parts.append((sheet((x, -0.004, z), (side, 0.0, 0.0), (0.0, 0.0, side), 1, 1), plain(shade)))
+            parts.append((sheet((left, -0.004, low), (w, 0.0, 0.0), (0.0, 0.0, h), 1, 1), plain(shade)))
     return parts
 
 
