@@ -68,7 +68,9 @@ def laptop() -> Mesh:
     lean = rotation("x", -20.0)
     hinge = np.array([0.0, 0.104, 0.006])
     lid = moved(screen, hinge + lean @ [0.0, 0.0, 0.1], lean)
-    return assemble([(base, key_paint), (lid, baked(screen_paint, screen))])
+    places = [(0.0205 * (column - 6), 0.0615 - 0.0235 * row) for row in range(4) for column in range(13)]
+    caps = [(block((0.0175, 0.019, 0.002), (x, y, 0.0076)), plain((84, 86, 92))) for x, y in places]
+    return assemble([(base, key_paint), *caps, (lid, baked(screen_paint, screen))])
 
 
 KEY_M = 0.019  # from one key to the next
