@@ -22,7 +22,7 @@ Key = tuple[str, str]
 TABLE_I = "map_50_paper"
 """The metric of the paper's Table I"""
 
-WITHIN_M = np.linspace(0.0, 0.1, 21)
+WITHIN_M = np.linspace(0.0, 0.1, 41)
 WITHIN_DEG = np.array([5.0, 10.0, 20.0, 45.0])
 """Thresholds of the curves of pose accuracy"""
 
