@@ -21,6 +21,7 @@ COMMANDS = [
     ["compare"],
     ["report"],
     ["bench", "render"],
+    ["bench", "paper"],
 ]
 HEAVY = ("cv2", "gtsam", "numba", "numpy", "open3d", "pandas", "pyrender", "scipy", "trimesh")
 
@@ -77,8 +78,9 @@ def test_config_prints_what_config_reads(tmp_path: Path) -> None:
         ["compare", "{run}", "--out", "{out}"],
         ["demo", "--out", "{out}"],
         ["bench", "render"],
+        ["bench", "paper", "--out", "{out}"],
     ],
-    ids=lambda a: a[0],
+    ids=" ".join,
 )
 def test_a_wrong_setting_is_one_clean_error_and_nothing_is_written(arguments: list[str], tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -146,3 +148,12 @@ def test_ctrl_c_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.exit_code == 130
     assert "ctmap inspect 'a run'" in result.stderr
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [(("--seeds", "some"), "reported"), (("--pass", "none"), "wrong-x4"), (("--methods", "none"), "filter-ct")],
+)
+def test_what_the_paper_has_not_is_one_clean_error(wrong: tuple[str, str], word: str, tmp_path: Path) -> None:
+    assert_clean_error(ctmap("bench", "paper", "--out", tmp_path / "out", *wrong), word)
+    assert not (tmp_path / "out").exists()
