@@ -197,13 +197,17 @@ def test_final_views_use_the_cameras_of_each_frame(small):
 
 
 def test_a_coarse_silhouette_has_nearly_the_same_box(small):
+    """Within a step on each side, and on the whole neither larger nor to one side."""
     run, truth = small
-    frame = run.frames[2]
-    objects = from_truth(run, truth)
-    args = run.catalogue, objects.class_id[:, 2], objects.T_camera_object[:, 2], frame.camera
-    for fine, coarse in zip(silhouettes(*args), silhouettes(*args, step=2), strict=True):
-        assert np.abs(np.array(fine.visible_box) - coarse.visible_box).max() <= 2
-        assert coarse.pixels == pytest.approx(fine.pixels, rel=0.1)
+    objects, differences = from_truth(run, truth), []
+    for f, frame in enumerate(run.frames[:6]):
+        for n in range(3):
+            only = run.catalogue, objects.class_id[[n], f], objects.T_camera_object[[n], f], frame.camera
+            (fine,), (coarse,) = silhouettes(*only), silhouettes(*only, step=3)
+            differences.append(np.array(coarse.box) - fine.box)
+            assert coarse.pixels == pytest.approx(fine.pixels, rel=0.1)
+    assert np.abs(differences).max() <= 4
+    assert np.abs(np.mean(differences, axis=0)).max() < 0.7
 
 
 def test_the_truths_own_boxes_come_before_drawn_ones(small):

@@ -138,8 +138,21 @@ def test_a_known_shift_has_known_scores(small, millimetres, strict, loose):
         assert found["add_auc"] == pytest.approx(1 - metres / 0.1)
         assert found["mssd_recall"] == pytest.approx(passed)
         assert found["adds_auc"] >= found["add_auc"]
+        assert found["mspd_recall"] == pytest.approx(_mspd_recall(run, truth, metres))
     for name in ("pose", "last_seen"):
         assert (found[f"{name}_2cm_10deg"], found[f"{name}_5cm_15deg"]) == (strict, loose)
+
+
+def _mspd_recall(run, truth, metres):
+    """Of a shift along the world's x: BOP's thresholds are 5, 10, ... 50 pixels where the image is 640 pixels wide."""
+    shift, thresholds, passed = np.array([metres, 0, 0]), np.arange(5, 51, 5) * run.frames[0].camera.width / 640, []
+    for thing in truth.objects:
+        for f, T in zip(thing.frames, thing.T_world_object, strict=True):
+            to_camera = se3.inverse(truth.T_world_camera[f])
+            points = se3.transform(T, run.catalogue[thing.obj_id].mesh.vertices)
+            images = [run.frames[f].camera.project(se3.transform(to_camera, x)) for x in (points, points + shift)]
+            passed.append(np.linalg.norm(images[1] - images[0], axis=-1).max() < thresholds)
+    return np.mean(passed)
 
 
 def test_a_known_turn_has_known_scores(small):
@@ -184,6 +197,8 @@ def test_last_seen_is_the_end_of_the_visit_at_the_last_view(small):
     found = judged(run, truth, early)
     assert found["last_seen_2cm_10deg"] == 1
     assert found["pose_2cm_10deg"] == pytest.approx(2 / len(run.frames))
+    # nor does it help to have been right when it was seen
+    assert judged(run, hidden(truth, 0, [END]), late)["last_seen_2cm_10deg"] == pytest.approx(5 / 6)
 
 
 def test_what_moved_after_it_was_last_seen_is_judged_where_it_was_seen(small):
@@ -211,6 +226,9 @@ def test_maps_at_the_ends_of_visits(small):
     ):
         found = judged(run, truth, estimate)
         assert (found["map_precision"], found["map_recall"]) == (pytest.approx(precision), pytest.approx(recall))
+    unseen = synthetic.estimate_of(run, truth, existence=lambda n, f: float(n != 0 or f < FRAMES))
+    found = judged(run, hidden(truth, 0, range(FRAMES, LAST + 1)), unseen)
+    assert (found["map_precision"], found["map_recall"]) == (1, 1)
     stale = judged(run, moved(truth, 2, FRAMES), perfect)
     assert (stale["map_precision"], stale["map_recall"]) == (pytest.approx(5 / 6), pytest.approx(5 / 6))
 
@@ -331,7 +349,13 @@ def test_a_gap_belongs_to_the_period_that_it_lies_around(small):
     true = hidden(moved(truth, 1, FRAMES), 1, [END, FRAMES])
     map_ = synthetic.estimate_of(run, true)
     whole = (run.frames[0].time_ns, run.frames[LAST].time_ns)
-    for gap, found in (((END - 1, FRAMES + 1), 1), ((END, FRAMES), 1), ((0, 2), 0), ((FRAMES + 1, LAST), 0)):
+    for gap, found in (
+        ((END - 1, FRAMES + 1), 1),
+        ((END, FRAMES), 1),
+        ((0, 2), 0),
+        ((END - 1, END), 0),
+        ((FRAMES + 1, LAST), 0),
+    ):
         assert judged(run, true, claiming(map_, (1, gap, 0.9, whole)))["moves_recall"] == found
 
 
@@ -444,6 +468,21 @@ def test_existence_scores_by_hand(small):
     assert found["existence_brier_score"] == pytest.approx(brier)
     log = -np.mean(np.log([*there, *(1 - np.array(gone))]))
     assert found["existence_log_score"] == pytest.approx(log)
+
+    later = estimate.existence.copy()
+    later[3, :FRAMES] = 0.0  # not in the map yet: no claim
+    found = judged(run, true, replace(estimate, existence=later))
+    assert found["existence_brier_score"] == pytest.approx(np.mean([*(np.array(there) - 1) ** 2, 0.9**2, 0.7**2]))
+
+
+def test_what_nobody_has_seen_yet_need_not_be_known(small):
+    """Object 0 is there, but hidden, in one visit: before it was ever seen that is no sample, afterwards it is one."""
+    run, truth = small
+    visits = range(FRAMES), range(FRAMES, LAST + 1)
+    for unseen, samples in ((0, [0.8, 0.6, 0.6, 0.6, 0.6]), (1, [0.8, 0.8, 0.6, 0.6, 0.6, 0.6])):
+        estimate = synthetic.estimate_of(run, truth, existence=lambda n, f: 0.8 if n == 0 else 0.6)
+        found = judged(run, hidden(truth, 0, visits[unseen]), estimate)
+        assert found["existence_log_score"] == pytest.approx(-np.mean(np.log(samples)))
 
 
 # --- records ---
