@@ -90,11 +90,14 @@ def quick(monkeypatch):
     monkeypatch.setattr("ctmap_gtsam.bench.paper.plots.write_plots", lambda folder, result: None)
 
 
-def run(out, *, seeds=SEEDS, passes="main", registry=FAKES, config=None, **changes):
+OWN = load_config(SETTINGS)
+
+
+def run(out, *, seeds=SEEDS, passes="main", registry=FAKES, config=OWN, **changes):
     shop = {"workers": 0, "say": lambda line: None, "manifest": out / "manifest.json"}
     task = Task(seeds, PROTOCOL.choose(passes), **{k: v for k, v in changes.items() if k in ("methods", "repeats")})
     shop |= {k: v for k, v in changes.items() if k not in ("methods", "repeats")}
-    return run_paper(out, config or Config(), task, Workshop(registry=registry, **shop))
+    return run_paper(out, config, task, Workshop(registry=registry, **shop))
 
 
 def without_seconds(value):
@@ -140,7 +143,7 @@ def test_what_is_damaged_or_of_something_else_is_done_again(tmp_path, damage, mo
     whole = run(tmp_path, seeds=(0,))
     before = times(tmp_path)
     stem = tmp_path / "units" / "main" / "000000" / "filter-ct-0"
-    config = Config()
+    config = OWN
     if damage == "settings":
         config = load_config(assignments=["sensor.kappa=0.06"])
     elif damage == "judge":
@@ -258,6 +261,13 @@ def test_repeats_are_other_draws_of_the_same_places(tmp_path):
     assert b[CEILING]["figures"]["map_50"] == a[CEILING]["figures"]["map_50"]
 
 
+def test_other_settings_than_the_benchmark_s_own_are_told(tmp_path):
+    assert run(tmp_path, seeds=(0,)).result["changed_settings"] == {}
+    outcome = run(tmp_path, seeds=(0,), config=replace(OWN, sensor=replace(OWN.sensor, kappa=0.06)))
+    assert outcome.result["changed_settings"] == {"sensor.kappa": 0.06}
+    assert "not the benchmark's own: sensor.kappa=0.06" in outcome.tables
+
+
 def test_pictures_and_tables_are_written(tmp_path):
     outcome = run(tmp_path, passes="main,shuffled")
     write_plots(tmp_path, outcome.result)
@@ -309,7 +319,7 @@ def test_draws_without_a_figure_leave_no_interval_where_they_are_many() -> None:
 
 
 def test_places_keep_within_their_bounds_and_differ() -> None:
-    places = [PROTOCOL.place(seed, Config()) for seed in (*PROTOCOL.sets["tuning"], *PROTOCOL.sets["reported"])]
+    places = [PROTOCOL.place(seed, OWN) for seed in (*PROTOCOL.sets["tuning"], *PROTOCOL.sets["reported"])]
     for place in places:
         motion, trajectory = place.simulation.motion, place.simulation.trajectory
         assert 60 <= motion.visits * trajectory.frames <= 100
@@ -328,27 +338,27 @@ def frozen(tmp_path, **changes):
 def test_the_manifest_knows_its_places_and_no_others(tmp_path, monkeypatch):
     protocol, shop = frozen(tmp_path)
     task = Task((2, 3), (MAIN_PASS,), protocol=protocol)
-    unfrozen = run_paper(tmp_path / "out", Config(), task, shop)
+    unfrozen = run_paper(tmp_path / "out", OWN, task, shop)
     assert unfrozen.result["frozen"] == {"holds": False, "complete": True, "reason": "no set has been frozen yet"}
     assert "not the frozen set" in unfrozen.tables
-    assert not freeze(tmp_path / "out", Config(), protocol, shop)
-    held = run_paper(tmp_path / "out", Config(), task, shop)
+    assert not freeze(tmp_path / "out", OWN, protocol, shop)
+    held = run_paper(tmp_path / "out", OWN, task, shop)
     assert held.result["frozen"] == {"holds": True, "complete": True, "reason": ""}
     assert "not" not in held.tables.split("|")[0]
-    some = run_paper(tmp_path / "out", Config(), replace(task, seeds=(3,)), shop)
+    some = run_paper(tmp_path / "out", OWN, replace(task, seeds=(3,)), shop)
     assert some.result["frozen"]["holds"]
     assert "not all" in some.tables
     other = load_config(assignments=["simulation.sensor.depth_noise=2.0"])
     changed = run_paper(tmp_path / "changed", other, task, shop)
     assert "settings" in changed.result["frozen"]["reason"]
-    assert run_paper(tmp_path / "out", Config(), replace(task, seeds=(0,)), shop).result["frozen"] is None
+    assert run_paper(tmp_path / "out", OWN, replace(task, seeds=(0,)), shop).result["frozen"] is None
 
 
 @pytest.mark.parametrize("name", ["rgb", "depth", "scene_detections.json", "scene_gt.json", "scene_camera_gt.json"])
 def test_the_manifest_catches_a_changed_byte(tmp_path, name):
     protocol, shop = frozen(tmp_path)
-    freeze(tmp_path / "out", Config(), protocol, shop)
-    place = protocol.place(2, Config())
+    freeze(tmp_path / "out", OWN, protocol, shop)
+    place = protocol.place(2, OWN)
     write_small(tmp_path / "run", place)
     assert guard({2: identify(tmp_path / "run", place)}, shop.manifest).holds
     scene = tmp_path / "run" / "test" / "000001"
@@ -370,7 +380,7 @@ def test_a_set_is_not_frozen_where_a_place_fails(tmp_path, monkeypatch):
 
     monkeypatch.setattr("ctmap_gtsam.bench.paper.units.simulate", fails)
     protocol, shop = frozen(tmp_path)
-    assert len(freeze(tmp_path / "out", Config(), protocol, shop)) == 2
+    assert len(freeze(tmp_path / "out", OWN, protocol, shop)) == 2
     assert not shop.manifest.exists()
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctmap_gtsam.bench.paper import places as frozen
 from ctmap_gtsam.bench.paper.agenda import Agenda, Failure, Say
 from ctmap_gtsam.bench.paper.places import Identity
-from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN, Place, Protocol, Variant, load_protocol
+from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN, SETTINGS, Place, Protocol, Variant, load_protocol
 from ctmap_gtsam.bench.paper.results import Key, Results, curves_json, differences_json, rows_json
 from ctmap_gtsam.bench.paper.units import Store, Unit
-from ctmap_gtsam.config import Config
+from ctmap_gtsam.config import Config, load_config
 from ctmap_gtsam.runtime.pool import work_off
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.versions import versions
@@ -182,6 +182,7 @@ def _summarise(
         "skipped": skipped,
         "failures": [{"job": f.job, "log": str(f.log), "reason": f.reason} for f in failures],
         "config": to_dict(store.config),
+        "changed_settings": _changed(store.config),
         "code": asdict(store.source),
         "versions": versions(),
     }
@@ -225,6 +226,20 @@ def _frozen(identities: Mapping[int, Identity], task: Task, workshop: Workshop) 
     guard = frozen.guard(identities, workshop.manifest)
     complete = set(task.seeds) == set(task.protocol.sets["reported"]) and len(identities) == len(task.seeds)
     return {"holds": guard.holds, "complete": complete, "reason": guard.reason}
+
+
+def _changed(config: Config) -> dict[str, Any]:
+    """Settings, by their dotted paths, that aren't the benchmark's own."""
+    own, now = (dict(_leaves(to_dict(replace(c, seed=0)))) for c in (load_config(SETTINGS), config))
+    return {path: value for path, value in now.items() if own[path] != value}
+
+
+def _leaves(settings: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", value
 
 
 def _about(place: Place, identity: Identity | None) -> dict[str, Any]:

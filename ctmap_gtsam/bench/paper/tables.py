@@ -38,6 +38,9 @@ def heading(result: Mapping[str, Any]) -> str:
         lines.append(f"**This is not the frozen set**: {result['frozen']['reason']}.")
     elif not result["frozen"]["complete"]:
         lines.append("These are some of the frozen set's places, not all.")
+    if result["changed_settings"]:
+        changed = ", ".join(f"{path}={value}" for path, value in result["changed_settings"].items())
+        lines.append(f"The settings are not the benchmark's own: {changed}.")
     return "\n\n".join(lines)
 
 
