@@ -62,7 +62,8 @@ def compare(
     """Run all methods on a run and hold them against the truth and each other.
 
     Writes DIR/summary.json, DIR/report.html, DIR/estimates/ and each method's results. Methods that ran before
-    with the same settings on the same run are not run again.
+    with the same settings on the same run are not run again. Without --methods all run, the baselines among them, which
+    take a fifth of the time; those named -oracle read the truth, as the paper's baselines do.
 
     Example: `ctmap compare recordings/kitchen --out results --methods filter-ct,smooth-ct --seed 1`
     """

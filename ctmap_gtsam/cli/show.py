@@ -80,6 +80,8 @@ def show_summary(path: Path) -> None:
     for name, method in methods.items():
         if method["status"] == "skipped":
             typer.echo(f"{name} skipped: {method['reason']} {method['remedy']}".rstrip())
+        elif method["reads_truth"]:
+            typer.echo(f"{name} reads the truth: true boxes and classes")
 
 
 def _show_table(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
