@@ -7,7 +7,7 @@ from typing import Any
 
 from ctmap_gtsam.bench.paper.protocol import CEILING, MAIN
 from ctmap_gtsam.bench.paper.results import TABLE_I
-from ctmap_gtsam.reporting.tables import COLUMNS, NOTHING, Column
+from ctmap_gtsam.reporting.tables import COLUMNS, MORE_COLUMNS, NOTHING, Column
 
 OWN_FRAMES = "map_50"
 """mAP of each frame's own estimate"""
@@ -79,9 +79,13 @@ def poses(result: Mapping[str, Any]) -> str:
 def further(result: Mapping[str, Any]) -> str:
     """The other metrics of the main pass."""
     rows = _rows(result, MAIN)
-    columns = [c for c in COLUMNS if any(row["figures"].get(c.key) is not None for row in rows)]
-    cells = [(said(row["method"], result), *(c.text(row["figures"].get(c.key)) for c in columns)) for row in rows]
-    return _table(("", *(_title(c) for c in columns)), cells)
+    parts = []
+    for group in (COLUMNS, MORE_COLUMNS):
+        columns = [c for c in group if c.key not in (TABLE_I, OWN_FRAMES, *POSES)]
+        columns = [c for c in columns if any(row["figures"].get(c.key) is not None for row in rows)]
+        cells = [(said(row["method"], result), *(c.text(row["figures"].get(c.key)) for c in columns)) for row in rows]
+        parts.append(_table(("", *(_title(c) for c in columns)), cells))
+    return "\n\n".join(parts)
 
 
 def differences(result: Mapping[str, Any]) -> str:
