@@ -41,19 +41,55 @@ def place(
     config_file: ConfigFile = None,
     assignments: Assignments = None,
     seed: Seed = None,
+    catalogue: Annotated[
+        Path | None,
+        typer.Option(
+            "--catalogue",
+            metavar="DIR",
+            help="Folder with models/ as BOP keeps them, and perhaps catalogue.json: these things instead of ours.",
+        ),
+    ] = None,
 ) -> None:
     """Simulate visits to a place with household objects, as a camera would have recorded them.
 
     Example: `ctmap simulate place runs/simulated --seed 1`
     """
-    simulate_into(run, settings(config_file, assignments, seed))
+    simulate_into(run, settings(config_file, assignments, seed), catalogue)
     typer.echo(run)
 
 
-def simulate_into(run: Path, config: Config) -> None:
-    """Write a simulated run, showing progress."""
+def simulate_into(run: Path, config: Config, catalogue: Path | None = None) -> None:
+    """Write a simulated run, with the things of a catalogue if one is given, showing progress."""
     from ctmap_gtsam.runtime.progress import RichProgress
     from sequences.simulation import simulate_place
+    from sequences.simulation.models import load_shapes
 
+    shapes = None if catalogue is None else load_shapes(catalogue)
     with RichProgress() as progress:
-        simulate_place(run, config.simulation, config.seed, progress)
+        simulate_place(run, config.simulation, config.seed, progress, shapes)
+
+
+@simulate_app.command()
+def detections(
+    run: RunFolder,
+    force: Annotated[bool, typer.Option("--force", help="Replace detections that no simulation made, too.")] = False,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+    scene: Scene = None,
+) -> None:
+    """Put a simulated detector before a run with truth: writes its scene_detections.json anew, nothing else.
+
+    What shows is drawn from the truth and the run's meshes, and hidden by whatever the recorded depth has before it.
+
+    Example: `ctmap simulate detections runs/simulated --set simulation.detector.noise=0.5 --seed 3`
+    """
+    from ctmap_gtsam.runtime.progress import RichProgress
+    from sequences.simulation.redetection import simulate_detections
+
+    config = settings(config_file, assignments, seed)
+    with RichProgress() as progress:
+        found = simulate_detections(
+            run, config.simulation.detector, config.seed, scene=scene, force=force, progress=progress
+        )
+    typer.echo(f"{found} detections")

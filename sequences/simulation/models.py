@@ -75,9 +75,10 @@ def stable_rests(mesh: Mesh) -> Array:
     from trimesh.poses import compute_stable_poses
 
     try:
-        hull: Any = trimesh.Trimesh(mesh.vertices, process=False).convex_hull
+        ConvexHull(mesh.vertices)  # trimesh makes a hull of what is flat, too, and then never ends
     except QhullError:
         return np.zeros((0, 3, 3))
+    hull: Any = trimesh.Trimesh(mesh.vertices, process=False).convex_hull
     poses, chances = compute_stable_poses(hull, sigma=0.0, n_samples=1, threshold=0.0)
     found: list[tuple[Array, float]] = []
     for R, chance in zip(poses[:, :3, :3], chances, strict=True):
