@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sequences.simulation.solids import (
-    Paint,
     Solid,
     block,
     lathe,
@@ -69,9 +68,9 @@ def _strip(x: Array, y: float, low: Array, high: Array) -> Solid:
     return np.stack([np.repeat(x, 2), vertices[:, 1], np.stack([low, high], axis=-1).ravel()], axis=-1), faces
 
 
-def _shaded(low: ArrayLike, high: ArrayLike, n: int) -> Paint:
+def _shaded(low: ArrayLike, high: ArrayLike, n: int) -> Array:
     """Colours of a strip of n columns, from its lower edge to its upper."""
-    return _keep(np.tile(np.array([low, high], dtype=np.float64), (n, 1)))
+    return np.tile(np.array([low, high], dtype=np.float64), (n, 1))
 
 
 def curtains(opening: Opening, colour: ArrayLike, to_floor: bool) -> Parts:
@@ -89,12 +88,8 @@ def curtains(opening: Opening, colour: ArrayLike, to_floor: bool) -> Parts:
         vertices = np.stack([x, -0.08 + (0.6 + 0.5 * down) * fold, top - down * (top - foot)], axis=-1)
         shade = np.clip(1.0 - 4.0 * fold, 0.8, 1.12)  # deep folds are darker than the lamp alone makes them
         dyed = np.clip(np.asarray(colour) * shade[:, None], 0.0, 255.0)
-        parts.append(((vertices, faces), _keep(dyed)))
+        parts.append(((vertices, faces), dyed))
     return parts
-
-
-def _keep(colours: Array) -> Paint:
-    return lambda _: colours
 
 
 def radiator(opening: Opening) -> Parts:

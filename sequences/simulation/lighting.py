@@ -175,8 +175,10 @@ def corner_normals(mesh: Mesh) -> Array:
     weighted = _area_vectors(mesh.vertices[mesh.faces])
     unit = _unit(weighted)
     n = mesh.faces.size
-    incidence = csr_array((np.ones(n), mesh.faces.ravel(), np.arange(n + 1)), shape=(n, len(mesh.vertices)))
-    pairs = (incidence @ incidence.T).tocoo()  # corners that share a vertex
+    places, place_of = np.unique(mesh.vertices, axis=0, return_inverse=True)  # colours may differ at one place
+    corner_at = place_of.reshape(-1)[mesh.faces.ravel()]
+    incidence = csr_array((np.ones(n), corner_at, np.arange(n + 1)), shape=(n, len(places)))
+    pairs = (incidence @ incidence.T).tocoo()  # corners that meet
     this, other = pairs.coords[0], pairs.coords[1] // 3
     smooth = np.einsum("ij,ij->i", unit[this // 3], unit[other]) > np.cos(CREASE_RAD)
     return _unit(

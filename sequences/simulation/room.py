@@ -15,7 +15,7 @@ from sequences import se3
 from sequences.catalogue import Mesh
 from sequences.simulation import fittings, solids
 from sequences.simulation.lighting import Window
-from sequences.simulation.solids import baked, moved, plain, rotation
+from sequences.simulation.solids import placed, plain, rotation
 from sequences.simulation.walls import (
     RECESS_M,
     Opening,
@@ -159,8 +159,8 @@ def _walls(size: Array, boxes: Array) -> list[_Wall]:
 
 
 def _put(parts: Parts, T: Array) -> Parts:
-    """Parts moved by T (4, 4), their colours kept."""
-    return [(moved(solid, T[:3, 3], T[:3, :3]), baked(paint, solid)) for solid, paint in parts]
+    """Parts moved by T (4, 4)."""
+    return [placed(part, T[:3, 3], T[:3, :3]) for part in parts]
 
 
 def _add_door(walls: Sequence[_Wall], rng: np.random.Generator) -> list[Array]:

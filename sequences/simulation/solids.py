@@ -1,7 +1,8 @@
 """Closed triangle meshes from a few numbers: turned, rounded, swept, joined and painted.
 
-Every builder gives a watertight mesh whose faces are counter-clockwise seen from outside, in metres. Where two colours
-shall meet at a sharp line, the builders are told to put two rows of vertices there, so that no face blends them.
+Every builder gives a watertight solid whose faces are counter-clockwise seen from outside, in metres. Where two colours
+shall meet at a sharp line, the builders are told to put a row of vertices there: a painted mesh has two vertices at one
+place where the faces about it differ in colour.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ Array = NDArray[np.float64]
 Solid = tuple[Array, NDArray[np.int32]]
 """vertices (V, 3), metres, and faces (F, 3)"""
 Paint = Callable[[Array], Array]
-"""vertices (V, 3) -> colours (V, 3), 0 to 255"""
+"""points (n, 3) -> colours (n, 3), 0 to 255"""
+Part = tuple[Solid, Paint | Array]
+"""a solid and its paint, or the colours (V, 3) of its vertices"""
 Mask = Callable[[Array], NDArray[np.bool_]]
 """vertices (V, 3) -> whether each belongs (V,)"""
 
-SEAM_M = 2e-4  # between the two rows of vertices where colours change
+INSET_M = 1e-4  # inwards from its corners a face shows its own colour, not that of the faces beside it
+ONE_COLOUR = 8.0  # colours that differ by less, of 255, are shades of one
 
 
 def arc(centre: tuple[float, float], radius: float, start_deg: float, stop_deg: float, n: int = 5) -> list[list[float]]:
@@ -31,10 +35,9 @@ def arc(centre: tuple[float, float], radius: float, start_deg: float, stop_deg: 
 
 
 def seam(a: ArrayLike, b: ArrayLike, at: float) -> list[list[float]]:
-    """Two points on the line a-b around its height `at`, for a sharp change of colour in a profile (r, z)."""
+    """The point on the line a-b at the height `at`, for a sharp change of colour in a profile (r, z)."""
     start, run = np.asarray(a, dtype=np.float64), np.subtract(b, a)
-    heights = at + np.array([-0.5, 0.5]) * SEAM_M * np.sign(run[1])
-    return (start + (heights[:, None] - start[1]) / run[1] * run).tolist()
+    return [(start + (at - start[1]) / run[1] * run).tolist()]
 
 
 def lathe(profile: Sequence[Sequence[float]], segments: int = 36) -> Solid:
@@ -173,7 +176,7 @@ def block(size: ArrayLike, at: ArrayLike = (0.0, 0.0, 0.0)) -> Solid:
 
 
 def scored(solid: Solid, axis: int | ArrayLike, places: Sequence[float]) -> Solid:
-    """The same surface with two rows of vertices along planes, where colours may then change sharply.
+    """The same surface with vertices along planes, where colours may then change sharply.
 
     Args:
         solid: what to score.
@@ -182,8 +185,7 @@ def scored(solid: Solid, axis: int | ArrayLike, places: Sequence[float]) -> Soli
     """
     normal = np.eye(3)[axis] if isinstance(axis, int) else np.asarray(axis, dtype=np.float64)
     for place in places:
-        for side in (-0.5, 0.5):
-            solid = _split(solid, normal, place + side * SEAM_M)
+        solid = _split(solid, normal, place)
     return solid
 
 
@@ -239,7 +241,7 @@ def rounded_box(
 def _grid_lines(half: float, radius: float, cuts: Sequence[float], steps: int) -> Array:
     """Coordinates of a box's grid lines along one axis. On the edge they are tangents, so that arcs are cut evenly."""
     edge = half - radius + radius * np.tan(np.linspace(0.0, np.pi / 4.0, steps // 2 + 1))
-    seams = [c + d for c in cuts for d in (-0.5 * SEAM_M, 0.5 * SEAM_M) if abs(c) < half - radius]
+    seams = [c for c in cuts if abs(c) < half - radius]
     return np.unique(np.round(np.concatenate([edge, -edge, seams]), 9))
 
 
@@ -310,10 +312,13 @@ def plain(colour: ArrayLike) -> Paint:
     return lambda vertices: np.broadcast_to(np.asarray(colour, dtype=np.float64), vertices.shape)
 
 
-def baked(paint: Paint, solid: Solid) -> Paint:
-    """The colours that a paint gives a solid where it is now, kept when the solid is moved."""
-    colours = paint(solid[0])
-    return lambda _: colours
+def placed(part: Part, offset: ArrayLike, R: Array | None = None) -> Part:
+    """A painted solid turned by R (3, 3), then shifted, metres; its print moves with it."""
+    solid, paint = part
+    shift, turn = np.asarray(offset, dtype=np.float64), np.eye(3) if R is None else R
+    if not callable(paint):
+        return moved(solid, shift, turn), paint
+    return moved(solid, shift, turn), lambda points: paint((points - shift) @ turn)
 
 
 def bands(axis: int, limits: Sequence[float], colours: Sequence[Sequence[float]]) -> Paint:
@@ -322,16 +327,37 @@ def bands(axis: int, limits: Sequence[float], colours: Sequence[Sequence[float]]
     return lambda vertices: table[np.searchsorted(np.asarray(limits), vertices[:, axis])]
 
 
-def join(parts: Sequence[tuple[Solid, Paint]]) -> Mesh:
+def join(parts: Sequence[Part]) -> Mesh:
     """Paint solids and join them where they are."""
     vertices = np.concatenate([solid[0] for solid, _ in parts])
-    colours = np.concatenate([np.asarray(paint(solid[0]), dtype=np.float64) for solid, paint in parts])
     starts = np.cumsum([0] + [len(solid[0]) for solid, _ in parts])
-    faces = np.concatenate([solid[1] + start for (solid, _), start in zip(parts, starts, strict=False)])
-    return Mesh(vertices, faces.astype(np.int32), np.clip(np.round(colours), 0, 255).astype(np.uint8))
+    corners = np.concatenate([solid[1] + start for (solid, _), start in zip(parts, starts, strict=False)])
+    colours = np.concatenate([_corner_colours(solid, paint) for solid, paint in parts])
+    rgb = np.clip(np.rint(colours), 0, 255).astype(np.int64) @ (1 << 16, 1 << 8, 1)
+    kinds, faces = np.unique(corners.reshape(-1) * (1 << 24) + rgb, return_inverse=True)
+    return Mesh(
+        vertices=vertices[kinds >> 24],
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        colours=np.stack([kinds >> 16, kinds >> 8, kinds], axis=-1).astype(np.uint8),
+    )
 
 
-def assemble(parts: Sequence[tuple[Solid, Paint]]) -> Mesh:
+def _corner_colours(solid: Solid, paint: Paint | Array) -> Array:
+    """(3 F, 3) colour at each corner of each face: its vertex's own, but where the face's is another."""
+    vertices, faces = solid
+    shared = np.asarray(paint(vertices) if callable(paint) else paint, dtype=np.float64)[faces]
+    if not callable(paint):
+        return shared.reshape(-1, 3)
+    corners = vertices[faces]
+    inwards = corners.mean(axis=1, keepdims=True) - corners
+    length = np.linalg.norm(inwards, axis=-1, keepdims=True)
+    inside = corners + inwards * np.minimum(INSET_M / np.maximum(length, 1e-12), 0.3)
+    own = np.asarray(paint(inside.reshape(-1, 3)), dtype=np.float64).reshape(corners.shape)
+    alike = np.abs(own - shared).max(axis=-1, keepdims=True) < ONE_COLOUR
+    return np.where(alike, shared, own).reshape(-1, 3)
+
+
+def assemble(parts: Sequence[Part]) -> Mesh:
     """As `join`, with the origin moved to the centre of the bounding box."""
     mesh = join(parts)
     centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0

@@ -12,10 +12,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sequences.simulation.solids import Paint, Solid, plain, printed
+from sequences.simulation.solids import Paint, Part, Solid, plain, printed
 
 Array = NDArray[np.float64]
-Parts = list[tuple[Solid, Paint]]
+Parts = list[Part]
 
 PLANK_M = (0.14, 1.3)
 TILE_M = 0.15  # of walls
@@ -180,10 +180,10 @@ def carpet(size: Sequence[float], rng: np.random.Generator) -> Parts:
     n, m = (int(np.ceil(s / 0.05)) for s in size)
     floor = _spread(size, 0.0, n, m)
     mottle = 1.0 + 0.035 * rng.standard_normal(len(floor[0]))
-    return [(floor, lambda _: base * mottle[:, None])]
+    return [(floor, base * mottle[:, None])]
 
 
-def _ground(size: Sequence[float], colour: ArrayLike) -> tuple[Solid, Paint]:
+def _ground(size: Sequence[float], colour: ArrayLike) -> Part:
     """What shows between boards or tiles."""
     return _spread(size, -0.002, 8, 8), plain(colour)
 

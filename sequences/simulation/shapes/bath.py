@@ -9,7 +9,6 @@ from sequences.catalogue import Mesh
 from sequences.simulation import solids
 from sequences.simulation.shapes.shape import BOX_TURNS, EITHER_WAY_UP, Entry
 from sequences.simulation.solids import (
-    SEAM_M,
     arc,
     assemble,
     bands,
@@ -35,9 +34,9 @@ def shampoo_bottle() -> Mesh:
     Depth can hardly tell it from the milk carton: the surfaces are a millimetre or two apart.
     """
     foot = [[0.032, 0.032, 0.0], [0.0345, 0.0345, 0.0015], [0.0355, 0.0355, 0.005]]
-    wall = [(0.0355, 0.0355, z + d * SEAM_M) for z in (0.05, 0.062, 0.135, 0.15) for d in (-0.5, 0.5)]
-    shoulder = [[0.0355, 0.0355, 0.191], [0.0352, 0.033, 0.195], [0.034, 0.0065, 0.2165], [0.0335, 0.0048, 0.219]]
-    cap = [[0.0335, 0.0048, 0.2192], [0.0338, 0.005, 0.222], [0.0335, 0.0042, 0.234], [0.033, 0.0032, 0.236]]
+    wall = [(0.0355, 0.0355, z) for z in (0.05, 0.062, 0.135, 0.15)]
+    shoulder = [[0.0355, 0.0355, 0.191], [0.0352, 0.033, 0.195], [0.034, 0.0065, 0.2165], [0.0335, 0.0048, 0.2191]]
+    cap = [[0.0338, 0.005, 0.222], [0.0335, 0.0042, 0.234], [0.033, 0.0032, 0.236]]
     body = stacked([*foot, *wall, *shoulder, *cap], power=9.0)
     violet, lilac, white, green = (126, 84, 168), (206, 184, 226), (244, 244, 242), (120, 176, 128)
     paint = printed(

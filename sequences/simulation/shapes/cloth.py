@@ -38,7 +38,7 @@ def clothed(shape: Shape, rng: np.random.Generator) -> Shape:
     ground, line = COLOURS[int(rng.integers(len(COLOURS)))]
     sections, lined = _sections(area.size / 2.0, min(OVERHANG_M, height - 0.1), rng.uniform(0.0, 2.0 * np.pi, 3))
     colours = np.where(np.append(np.repeat(lined, sections.shape[1]), [False, False])[:, None], line, ground)
-    cloth = join([(moved(loft(sections), area.centre), lambda _: colours)])
+    cloth = join([(moved(loft(sections), area.centre), colours)])
     covered = Mesh(
         np.concatenate([mesh.vertices, cloth.vertices]),
         np.concatenate([mesh.faces, cloth.faces + np.int32(len(mesh.vertices))]),

@@ -11,13 +11,13 @@ from sequences.catalogue import Mesh
 from sequences.simulation.shapes.shape import UPRIGHT, Clutter
 from sequences.simulation.solids import (
     Paint,
-    Solid,
+    Part,
     arc,
     assemble,
-    baked,
     bands,
     lathe,
     moved,
+    placed,
     plain,
     printed,
     puff,
@@ -31,7 +31,7 @@ from sequences.simulation.solids import (
 )
 
 Array = NDArray[np.float64]
-Parts = list[tuple[Solid, Paint]]
+Parts = list[Part]
 
 GOLDEN_RAD = 2.39996  # from leaf to leaf
 
@@ -85,7 +85,7 @@ def papers() -> Mesh:
             (within(x=(-0.08, 0.08), y=(-0.08, 0.02)), (206, 206, 208)),
             (within(x=(-0.08, 0.03), y=(0.1, 0.13)), (96, 106, 130)),
         )
-        parts.append((moved(sheets, (x, y, 0.0035 * (k + 0.5)), rotation("z", yaw)), baked(text, sheets)))
+        parts.append(placed((sheets, text), (x, y, 0.0035 * (k + 0.5)), rotation("z", yaw)))
     return assemble(parts)
 
 
@@ -228,9 +228,9 @@ def photo_frame() -> Mesh:
         (within(x=(-0.055, 0.055), y=(-1.0, 0.0), z=(-0.08, 0.03)), (112, 142, 108)),
         (within(x=(-0.055, 0.055), y=(-1.0, 0.0), z=(-0.08, -0.01)), (196, 178, 132)),
     )
-    leaning = moved(board, (0.0, 0.0, -float((board[0] @ lean.T)[:, 2].min())), lean)
+    leaning = placed((board, paint), (0.0, 0.0, -float((board[0] @ lean.T)[:, 2].min())), lean)
     stand = np.array([[0.0, 0.03, 0.15], [0.0, 0.055, 0.075], [0.0, 0.08, 0.01], [0.0, 0.08, 0.0]])
-    return assemble([(leaning, baked(paint, board)), (tube(stand, 0.006, 8), plain((60, 46, 38)))])
+    return assemble([leaning, (tube(stand, 0.006, 8), plain((60, 46, 38)))])
 
 
 def tissue_box() -> Mesh:
@@ -258,8 +258,8 @@ def magazines() -> Mesh:
             (within(x=(-0.09, 0.09), y=(-0.12, -0.02)), np.array(ground) * 0.75),
             (within(z=(-0.0016, 0.0016)), (236, 234, 228)),
         )
-        turned = moved(solid, (0.006 * k, -0.004 * k, 0.003 + 0.006 * k), rotation("z", (4.0, -11.0, 7.0)[k]))
-        parts.append((turned, baked(paint, solid)))
+        at = (0.006 * k, -0.004 * k, 0.003 + 0.006 * k)
+        parts.append(placed((solid, paint), at, rotation("z", (4.0, -11.0, 7.0)[k])))
     return assemble(parts)
 
 

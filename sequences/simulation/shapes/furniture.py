@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from sequences.catalogue import Mesh
 from sequences.simulation.shapes.shape import Entry, SupportArea
 from sequences.simulation.solids import (
-    Paint,
-    Solid,
+    Part,
     assemble,
     block,
     cuts_every,
@@ -64,12 +63,12 @@ def desk() -> Mesh:
     white, steel, front = (222, 218, 208), (72, 74, 78), (206, 200, 188)
     top = rounded_box((width, depth, 0.028), 0.003, (cuts_every(0.12, width / 2), cuts_every(0.1, depth / 2), ()))
     leg = rounded_box((0.05, 0.05, height - 0.02), 0.003)
-    legs: list[tuple[Solid, Paint]] = [
+    legs: list[Part] = [
         (moved(leg, (-width / 2 + 0.04, j * (depth / 2 - 0.04), height / 2 - 0.01)), plain(steel)) for j in (-1, 1)
     ]
     beam = moved(block((width - 0.1, 0.02, 0.06)), (0.0, depth / 2 - 0.04, height - 0.058))
     chest = moved(rounded_box((0.38, depth - 0.06, height - 0.03), 0.003), (width / 2 - 0.21, 0.0, height / 2 - 0.015))
-    drawers: list[tuple[Solid, Paint]] = []
+    drawers: list[Part] = []
     for k in range(3):
         z = height - 0.15 - 0.225 * k
         at = (width / 2 - 0.21, -depth / 2 + 0.026, z)
@@ -86,7 +85,7 @@ def side_table() -> Mesh:
     walnut, dark = (116, 78, 52), (92, 62, 42)
     top = rounded_box((width, depth, 0.024), 0.008, (cuts_every(0.08, width / 2), cuts_every(0.08, depth / 2), ()))
     board = rounded_box((width - 0.08, depth - 0.08, 0.016), 0.003)
-    legs: list[tuple[Solid, Paint]] = []
+    legs: list[Part] = []
     for i in (-1, 1):
         for j in (-1, 1):
             x, y = i * (width / 2 - 0.045), j * (depth / 2 - 0.045)
@@ -105,7 +104,7 @@ def cabinet() -> Mesh:
         rounded_box((width - 0.02, depth - 0.03, height - 0.125), 0.003), (0.0, 0.005, 0.1 + (height - 0.125) / 2)
     )
     top = rounded_box((width, depth, 0.028), 0.005, (cuts_every(0.1, width / 2), cuts_every(0.1, depth / 2), ()))
-    parts: list[tuple[Solid, Paint]] = [(body, plain(paint))]
+    parts: list[Part] = [(body, plain(paint))]
     for i in (-1, 1):
         x, y = i * (width - 0.02) / 4, -depth / 2 + 0.014
         for z, tall in ((0.37, 0.5), (0.73, 0.19)):
@@ -144,7 +143,7 @@ def sofa() -> Mesh:
     back = moved(
         rounded_box((width, 0.18, height - 0.1), 0.05, steps=4), (0.0, depth / 2 - 0.09, 0.1 + (height - 0.1) / 2)
     )
-    parts: list[tuple[Solid, Paint]] = [(base, plain(cloth)), (back, plain(cloth))]
+    parts: list[Part] = [(base, plain(cloth)), (back, plain(cloth))]
     lean = rotation("x", -12.0)
     for i in (-1, 1):
         arm = moved(rounded_box((0.13, depth, 0.5), 0.05, steps=4), (i * (width / 2 - 0.065), 0.0, 0.34))
@@ -165,7 +164,7 @@ def chair() -> Mesh:
     beech, dark = (200, 158, 108), (176, 134, 88)
     cuts = (cuts_every(0.08, width / 2), cuts_every(0.08, depth / 2), ())
     seat = moved(rounded_box((width, depth - 0.04, 0.022), 0.008, cuts), (0.0, -0.02, CHAIR_SEAT_M - 0.011))
-    parts: list[tuple[Solid, Paint]] = [(seat, grained(beech, 0.05))]
+    parts: list[Part] = [(seat, grained(beech, 0.05))]
     for i in (-1, 1):
         x = i * (width / 2 - 0.03)
         front = np.array([[x, -depth / 2 + 0.03, z] for z in (0.0, 0.2, CHAIR_SEAT_M - 0.01)])

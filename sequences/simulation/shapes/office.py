@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from sequences.catalogue import Mesh
 from sequences.simulation.shapes.shape import EITHER_WAY_UP, Entry
 from sequences.simulation.solids import (
-    Paint,
-    Solid,
+    Part,
     assemble,
-    baked,
     bands,
     block,
     moved,
+    placed,
     plain,
     printed,
     rotation,
@@ -67,10 +66,10 @@ def laptop() -> Mesh:
 
     lean = rotation("x", -20.0)
     hinge = np.array([0.0, 0.104, 0.006])
-    lid = moved(screen, hinge + lean @ [0.0, 0.0, 0.1], lean)
+    lid = placed((screen, screen_paint), hinge + lean @ [0.0, 0.0, 0.1], lean)
     places = [(0.0205 * (column - 6), 0.0615 - 0.0235 * row) for row in range(4) for column in range(13)]
     caps = [(block((0.0175, 0.019, 0.002), (x, y, 0.0076)), plain((84, 86, 92))) for x, y in places]
-    return assemble([(base, key_paint), *caps, (lid, baked(screen_paint, screen))])
+    return assemble([(base, key_paint), *caps, lid])
 
 
 KEY_M = 0.019  # from one key to the next
@@ -82,7 +81,7 @@ def keyboard() -> Mesh:
     body = moved(rounded_box((0.436, 0.136, 0.014), 0.004), (0.0, 0.0, 0.0), tilt)
     low = float(body[0][:, 2].min())
     black, dark, light = (34, 35, 38), (58, 60, 64), (86, 88, 94)
-    parts: list[tuple[Solid, Paint]] = [(body, plain(black))]
+    parts: list[Part] = [(body, plain(black))]
     parts += [(block((0.03, 0.01, -low), (i * 0.18, 0.052, low / 2)), plain(black)) for i in (-1, 1)]  # feet
     for row, count in enumerate((14, 15, 14, 13, 12)):
         y = 0.043 - KEY_M * row - (0.006 if row else 0.0)
@@ -162,7 +161,7 @@ def remote_control() -> Mesh:
         [1.0 - 8.0 * (0.05 - body[0][:, 1]).clip(0.0) ** 2, *np.ones((2, len(body[0])))], axis=-1
     )
     black, grey, red, blue = (32, 32, 35), (112, 114, 120), (206, 40, 40), (60, 96, 176)
-    keys: list[tuple[Solid, Paint]] = [(block((0.012, 0.008, 0.003), (-0.014, 0.075, 0.0095)), plain(red))]
+    keys: list[Part] = [(block((0.012, 0.008, 0.003), (-0.014, 0.075, 0.0095)), plain(red))]
     for row in range(6):
         for column in range(3):
             at = (0.0135 * (column - 1), 0.052 - 0.0145 * row - 0.008 * (row > 1), 0.0095)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from sequences.catalogue import Mesh
 from sequences.simulation.shapes.shape import EITHER_WAY_UP, Entry
 from sequences.simulation.solids import (
-    SEAM_M,
     assemble,
     bands,
     loft,
@@ -71,14 +70,14 @@ def _about_x(x: Array, radius: Array, angle: Array) -> tuple[Array, NDArray[np.i
 def tape_roll() -> Mesh:
     """A roll of parcel tape of 120 x 50 mm on its cardboard core, lying flat; upside down it is the same."""
     half, outer, core, card_m = 0.025, 0.06, 0.038, 0.0405
-    low = [[core, -half], [card_m, -half], [card_m + SEAM_M, -half], [outer - 0.001, -half], [outer, -half + 0.001]]
+    low = [[core, -half], [card_m, -half], [outer - 0.001, -half], [outer, -half + 0.001]]
     outline = [*low, *[[r, -z] for r, z in reversed(low)]]
     brown, card, side = (186, 136, 76), (150, 116, 84), (206, 166, 108)
 
     def paint(vertices: Array) -> Array:
         r = np.hypot(vertices[:, 0], vertices[:, 1])
-        colours = np.where((np.abs(vertices[:, 2]) > half - 0.0005)[:, None], side, brown)
-        return np.where((r < card_m + SEAM_M / 2.0)[:, None], card, colours)
+        colours = np.where((np.abs(vertices[:, 2]) > half - 2e-5)[:, None], side, brown)
+        return np.where((r < card_m)[:, None], card, colours)
 
     return assemble([(ring(outline, 40), paint)])
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sequences.simulation import solids
-from sequences.simulation.solids import SEAM_M, Solid
+from sequences.simulation.solids import Solid
 from tests.sequences.simulation.solid_geometry import distances
 
 SOLIDS = {
@@ -53,7 +53,7 @@ def test_a_superellipse_fulfils_its_equation(power, n):
 @given(
     normal=st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda n: np.linalg.norm(n) > 0.1), share=st.floats(0.1, 0.9)
 )
-def test_scoring_leaves_the_surface_as_it_is_and_lets_colours_change_sharply(solid, normal, share):
+def test_scoring_leaves_the_surface_as_it_is(solid, normal, share):
     normal = np.array(normal) / np.linalg.norm(normal)
     level = solid[0] @ normal
     place = float(level.min() + share * np.ptp(level))
@@ -65,18 +65,44 @@ def test_scoring_leaves_the_surface_as_it_is_and_lets_colours_change_sharply(sol
     new = scored[0][len(solid[0]) :]
     if len(new):
         assert distances(new, *solid).max() < 1e-9
-    # a face reaches over the place by no more than the seam
+    # no face reaches over the place
     reach = scored[0][scored[1]] @ normal - place
-    over = (reach.min(axis=1) < -1e-5) & (reach.max(axis=1) > 1e-5)
-    assert np.ptp(reach[over], axis=1).max(initial=0.0) < SEAM_M + 1e-5
+    assert not ((reach.min(axis=1) < -1e-5) & (reach.max(axis=1) > 1e-5)).any()
 
 
-def test_paint_that_is_baked_moves_with_its_solid():
+def test_paint_moves_with_its_solid():
     box = SOLIDS["box"]
     halves = solids.bands(2, [0.0], [(255, 0, 0), (0, 0, 255)])
-    turned = solids.moved(box, (0.0, 0.0, 5.0), solids.rotation("x", 180.0))
-    np.testing.assert_array_equal(solids.baked(halves, box)(turned[0]), halves(box[0]))
-    assert not np.array_equal(halves(turned[0]), halves(box[0]))
+    R, shift = solids.rotation("x", 180.0), np.array([0.0, 0.0, 5.0])
+    turned, paint = solids.placed((box, halves), shift, R)
+    np.testing.assert_allclose(turned[0], box[0] @ R.T + shift)
+    np.testing.assert_array_equal(paint(turned[0]), halves(box[0]))
+    _, colours = solids.placed((box, halves(box[0])), shift, R)
+    np.testing.assert_array_equal(colours, halves(box[0]))
+
+
+@every_solid
+@settings(max_examples=8)
+@given(share=st.floats(0.2, 0.8))
+def test_colours_meet_at_a_line_and_each_face_has_one(solid, share):
+    place = float(solid[0][:, 2].min() + share * np.ptp(solid[0][:, 2]))
+    scored = solids.scored(solid, 2, [place])
+    mesh = solids.join([(scored, solids.bands(2, [place], [(200, 0, 0), (0, 0, 200)]))])
+    colours = mesh.colours[mesh.faces].astype(int)
+    assert (np.ptp(colours, axis=1) == 0).all()
+    middle = mesh.vertices[mesh.faces].mean(axis=1)[:, 2]
+    clear = np.abs(middle - place) > 1e-3
+    np.testing.assert_array_equal(colours[clear, 0, 0] > 0, middle[clear] < place)
+    assert {tuple(v) for v in mesh.vertices} == {tuple(v) for v in scored[0][np.unique(scored[1])]}
+    assert mesh.is_solid == solids.join([(solid, solids.plain((1, 1, 1)))]).is_solid
+
+
+def test_shades_are_blended_over_a_face():
+    solid = SOLIDS["box"]
+    mesh = solids.join([(solid, lambda v: 100.0 + 800.0 * v)])
+    assert len(mesh.vertices) == len(solid[0])
+    given = solids.join([(solid, np.full((len(solid[0]), 3), 7.0))])
+    np.testing.assert_array_equal(given.colours, 7)
 
 
 def test_later_patches_are_printed_over_earlier_ones():
