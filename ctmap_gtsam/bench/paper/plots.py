@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SYNTHETIC = "simulated places, synthetic"
-
-
 def write_plots(folder: Path, result: Mapping[str, Any]) -> None:
     """Write all there is to draw."""
     import io
@@ -54,7 +51,7 @@ def table_i(result: Mapping[str, Any]) -> Figure | None:
         paper = result["paper"].get(row["method"])
         if paper is not None:
             ax.plot([paper], [y], marker="D", color="none", markeredgecolor="#1b1b1b", markersize=6.5)
-    ax.plot([], [], "o", color="#50565e", label=f"{SYNTHETIC}, with 95 % over places")
+    ax.plot([], [], "o", color="#50565e", label="here, with 95 % over places")
     ax.plot([], [], "D", color="none", markeredgecolor="#1b1b1b", label="the paper, on its own sequences")
     ax.set_xlim(0.0, 1.02)
     ax.set_xlabel("mAP by the paper's protocol")
@@ -80,7 +77,7 @@ def pose_accuracy(result: Mapping[str, Any]) -> Figure | None:
         ax.set_xlim(0.0, within[-1])
         ax.set_ylim(0.0, 1.02)
         if kind == "last_seen":
-            ax.set_title(f"within {angles[n]:g}°" + (f", {SYNTHETIC}" if n == 0 else ""), loc="left", fontsize=10)
+            ax.set_title(f"within {angles[n]:g}°", loc="left", fontsize=10)
         else:
             ax.set_xlabel("and within, cm")
         if n == 0:
@@ -111,7 +108,7 @@ def by_place(result: Mapping[str, Any]) -> Figure | None:
         )
     ax.set_xticks(range(len(order)), order)
     ax.set_ylim(0.0, 1.02)
-    ax.set_xlabel(f"seed of the place, the detector's worst first ({SYNTHETIC})")
+    ax.set_xlabel("seed of the place, the detector's worst first")
     ax.set_ylabel("mAP by the paper's protocol")
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     return figure
@@ -127,7 +124,7 @@ def changes(result: Mapping[str, Any]) -> Figure | None:
     for y, d in enumerate(found):
         _dot(ax, y, d["figures"][TABLE_I], d["intervals"].get(TABLE_I), _colour(d["row"][1]))
     ax.axvline(0.0, color="#50565e", linewidth=1)
-    ax.set_xlabel(f"mAP by the paper's protocol, minus the same with nothing changed ({SYNTHETIC})")
+    ax.set_xlabel("mAP by the paper's protocol, minus the same with nothing changed")
     _name_rows(ax, [f"{d['row'][0]}: {d['row'][1]}" for d in found])
     return figure
 
@@ -159,6 +156,7 @@ def _figure(shape: tuple[int, int], size: tuple[float, float]) -> tuple[Figure, 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle("simulated places (synthetic)", x=0.995, ha="right", fontsize=8, color="#50565e")
     return figure, [figure.add_subplot(*shape, k + 1) for k in range(shape[0] * shape[1])]
 
 
