@@ -7,7 +7,7 @@ boxes' centres, stays finite. A median is infinite where half of the object-fram
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -17,7 +17,7 @@ from ctmap_gtsam.evaluation import detection, pose
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
 from ctmap_gtsam.evaluation.pose import Shape
 from ctmap_gtsam.evaluation.statistics import log_score, mean, median
-from ctmap_gtsam.evaluation.vsd import SHARES, vsd_recall
+from ctmap_gtsam.evaluation.vsd import SHARES, Scene, vsd_recall
 from sequences.camera import Camera
 from sequences.types import Run
 
@@ -93,9 +93,14 @@ class FrameErrors:
 
 
 def frame_errors(
-    run: Run, method: MethodMap, truth: ObjectFrames, matching: Matching, shapes: dict[int, Shape], step: int
+    run: Run,
+    method: MethodMap,
+    truth: ObjectFrames,
+    matching: Matching,
+    shapes: dict[int, Shape],
+    measured: Mapping[int, Scene],
 ) -> FrameErrors:
-    """(N, F) how a method fares at the true objects, by `matching`; for VSD every `step`-th pixel is looked at."""
+    """(N, F) how a method fares at the true objects, by `matching`; VSD in the frames of `measured` (`vsd.scenes`)."""
     said = detection.matched_class(method.objects, matching)
     translation, rotation, mssd, add, adds, mspd = (np.where(truth.visible, np.inf, np.nan) for _ in range(6))
     diameters, widths = np.ones(truth.visible.shape), np.array([frame.camera.width for frame in run.frames])
@@ -127,7 +132,7 @@ def frame_errors(
         adds_m=adds,
         mssd_recall=_recall(mssd / diameters),
         mspd_recall=_recall(mspd / widths * (640.0 / 100.0)),  # 5 px of 640 is the least threshold, as 5 % is
-        vsd_recall=vsd_recall(run, truth, method.objects, matching, step),
+        vsd_recall=vsd_recall(run.catalogue, measured, truth, method.objects, matching),
     )
 
 

@@ -38,6 +38,7 @@ from ctmap_gtsam.evaluation.moves import Periods
 from ctmap_gtsam.evaluation.trajectory import CameraErrors
 from ctmap_gtsam.evaluation.views import final_views, views
 from ctmap_gtsam.evaluation.visits import LastSeen, MapEnds
+from ctmap_gtsam.evaluation.vsd import Scene, scenes
 from sequences.atomic import write_npz
 from sequences.errors import InputError
 from sequences.types import Run, Truth
@@ -170,11 +171,16 @@ class Judge:
         """The true objects' boxes."""
         return true_boxes(self.run, self.truth, self.objects, self._step)
 
+    @cached_property
+    def scenes(self) -> dict[int, Scene]:
+        """The depth images that VSD looks at."""
+        return scenes(self.run, self._step)
+
     def estimate(self, method: MethodMap) -> Judgement:
         """Judge a method that has poses."""
         matching = match(self.objects, method.objects, self.shapes)
         case = self.run, method, self.objects, matching
-        errors = frames.frame_errors(*case, self.shapes, self._step)
+        errors = frames.frame_errors(*case, self.shapes, self.scenes)
         obj_ids = self.run.catalogue.obj_ids
         own = [view.boxes() for view in views(self.run, method.estimate, self._step)]
         final = [view.boxes() for view in final_views(self.run, method.estimate, self._step)]

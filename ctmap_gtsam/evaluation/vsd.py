@@ -7,7 +7,8 @@ no symmetries: poses that can't be told apart have no error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from ctmap_gtsam.evaluation.detection import matched_class
 from ctmap_gtsam.evaluation.matching import Matching, ObjectFrames
 from ctmap_gtsam.evaluation.silhouettes import Window, draw
 from sequences.camera import Camera
-from sequences.catalogue import Mesh
+from sequences.catalogue import Catalogue, Mesh, ObjectClass
 from sequences.types import Frame, Run
 
 Array = NDArray[np.float64]
@@ -31,6 +32,16 @@ TOLERANCE_M = 0.015
 
 SHARES = np.linspace(0.05, 0.5, 10)
 """Of the diameter: the misalignment tau that is tolerated. As thresholds of the error: theta"""
+
+
+class Scene(NamedTuple):
+    """What was measured in one frame."""
+
+    camera: Camera
+    distance: NDArray[np.float32]
+    """(h, w) metres, 0 where there is none"""
+    stretch: NDArray[np.float32]
+    """(h, w) distance over depth"""
 
 
 def vsd(scene: Floats, estimated: Floats, true: Floats, tau: Array) -> Array:
@@ -64,47 +75,52 @@ def recall(errors: Array) -> float:
     return float((errors[:, None] < SHARES).mean())
 
 
-def vsd_recall(run: Run, truth: ObjectFrames, estimated: ObjectFrames, matching: Matching, step: int = 1) -> Array:
-    """(N, F) `recall` of each true object in every EVERY-th frame of a visit; NaN where it isn't asked.
+def scenes(run: Run, step: int = 1) -> dict[int, Scene]:
+    """What was measured in every EVERY-th frame of each visit, by frame; every `step`-th pixel each way."""
+    return {frame.index: _scene(frame, step) for visit in run.visits for frame in visit.frames[::EVERY]}
+
+
+def _scene(frame: Frame, step: int) -> Scene:
+    camera = frame.camera.window(0, 0, -(-frame.camera.width // step), -(-frame.camera.height // step), step)
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    stretch = np.linalg.norm(camera.backproject(u, v, np.ones(u.shape)), axis=-1).astype(np.float32)
+    return Scene(camera, frame.read_depth()[::step, ::step] * stretch, stretch)
+
+
+def vsd_recall(
+    catalogue: Catalogue,
+    measured: Mapping[int, Scene],
+    truth: ObjectFrames,
+    estimated: ObjectFrames,
+    matching: Matching,
+) -> Array:
+    """(N, F) `recall` of each true object in each frame that was measured; NaN in others, and where it isn't asked.
 
     A true object whose match is absent, or has another class, has recall 0.
 
     Args:
-        run: its depth images are the scene.
+        catalogue: the meshes.
+        measured: from `scenes`.
         truth: in the true cameras.
         estimated: in the method's own.
         matching: of the two.
-        step: every `step`-th pixel each way is looked at.
     """
     said = matched_class(estimated, matching)
     out = np.full(truth.visible.shape, np.nan)
-    for visit in run.visits:
-        for frame in visit.frames[::EVERY]:
-            f = frame.index
-            asked = np.flatnonzero(truth.visible[:, f])
-            out[asked, f] = 0.0
-            right = asked[said[asked, f] == truth.class_id[asked, f]]
-            if len(right):
-                poses = truth.T_camera_object[right, f], estimated.T_camera_object[matching.row[right], f]
-                out[right, f] = _recalls(run, frame, truth.class_id[right, f], *poses, step)
+    for f, scene in measured.items():
+        asked = np.flatnonzero(truth.visible[:, f])
+        out[asked, f] = 0.0
+        for n in asked[said[asked, f] == truth.class_id[asked, f]]:
+            poses = estimated.T_camera_object[matching.row[n], f], truth.T_camera_object[n, f]
+            out[n, f] = _recall(catalogue[int(truth.class_id[n, f])], poses, scene)
     return out
 
 
-def _recalls(
-    run: Run, frame: Frame, classes: Sequence[int] | NDArray[np.int64], T_true: Array, T_estimated: Array, step: int
-) -> list[float]:
-    """Of n objects of one frame at poses (n, 4, 4) in the camera."""
-    camera = frame.camera.window(0, 0, -(-frame.camera.width // step), -(-frame.camera.height // step), step)
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    stretch = np.linalg.norm(camera.backproject(u, v, np.ones(u.shape)), axis=-1)
-    scene = frame.read_depth()[::step, ::step] * stretch
-    found = []
-    for obj_id, true, estimated in zip(classes, T_true, T_estimated, strict=True):
-        thing = run.catalogue[int(obj_id)]
-        part, surfaces = _surfaces(thing.mesh, (estimated, true), camera)
-        ours, theirs = (surface * stretch[part] for surface in surfaces)
-        found.append(recall(vsd(scene[part], ours, theirs, SHARES * thing.diameter_m)))
-    return found
+def _recall(thing: ObjectClass, poses: tuple[Array, Array], scene: Scene) -> float:
+    """Of one object, estimated and truly at poses (4, 4) in the camera."""
+    part, surfaces = _surfaces(thing.mesh, poses, scene.camera)
+    estimated, true = (surface * scene.stretch[part] for surface in surfaces)
+    return recall(vsd(scene.distance[part], estimated, true, SHARES * thing.diameter_m))
 
 
 def _surfaces(mesh: Mesh, poses: Sequence[Array], camera: Camera) -> tuple[Window, list[NDArray[np.float32]]]:
