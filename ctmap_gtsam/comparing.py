@@ -309,7 +309,8 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 
 def _outcome(out: Path, name: str, told: Mapping[str, Any]) -> Outcome:
+    reads_truth = told.get("reads_truth", False)
     if told["status"] == "skipped":
-        return Outcome("skipped", reason=told["reason"], remedy=told["remedy"], reads_truth=told.get("reads_truth", False))
+        return Outcome("skipped", reason=told["reason"], remedy=told["remedy"], reads_truth=reads_truth)
     estimate = None if name == DETECTOR else Estimate.load(out / ESTIMATES / f"{name}.npz")
-    return Outcome("ok", told["seconds"], estimate, reads_truth=told.get("reads_truth", False))
+    return Outcome("ok", told["seconds"], estimate, reads_truth=reads_truth)
