@@ -228,7 +228,7 @@ def test_figures_depend_on_no_number_of_workers(tmp_path, monkeypatch):
     for workers in (0, 2):
         out = tmp_path / str(workers)
         shop = Workshop(workers=workers, registry=FAKES, say=lambda line: None)
-        task = Task((0, 1), (MAIN_PASS,), ("detector", "filter-t"), protocol=protocol)
+        task = Task((0, 1), (MAIN_PASS,), ("filter-t",), protocol=protocol)
         outcome = run_paper(out, config, task, shop)
         assert not outcome.failures
         results.append(without_seconds(outcome.result))
