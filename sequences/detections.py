@@ -1,6 +1,9 @@
-"""Detections on disk: scene_detections.json, COCO results with class_scores."""
+"""Detections on disk: scene_detections.json, COCO results with class_scores, and who said so."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,3 +92,30 @@ def _class_scores(node: Node, obj_ids: tuple[int, ...]) -> tuple[Array, bool]:
     if obj_ids:
         scores[1 + obj_ids.index(node["category_id"].integer())] = score
     return scores, True
+
+
+def detection_json(
+    detection: Detection, scene_id: int, im_id: int, obj_ids: tuple[int, ...], source: str
+) -> dict[str, Any]:
+    """A detection as scene_detections.json has it; `source` is what made it, such as "simulation"."""
+    best = int(np.argmax(detection.class_scores[1:]))
+    return {
+        "scene_id": scene_id,
+        "image_id": im_id,
+        "category_id": obj_ids[best],
+        "bbox": [float(value) for value in detection.box],
+        "score": float(detection.class_scores[1 + best]),
+        "class_scores": detection.class_scores.tolist(),
+        "source": source,
+    }
+
+
+def sources(file: Path) -> set[str | None]:
+    """What made the detections of a scene_detections.json; None stands for those that don't say.
+
+    Empty where there is no file, or nothing in it. Raises InputError where it isn't JSON.
+    """
+    if not file.is_file():
+        return set()
+    said = [node.get("source") for node in Node.read(file, "").elements()]
+    return {None if node is None else node.text() for node in said}

@@ -17,6 +17,7 @@ from sequences import layout, se3
 from sequences.atomic import replace_folder, write_json
 from sequences.camera import Camera
 from sequences.catalogue import Catalogue, ObjectClass
+from sequences.detections import detection_json
 from sequences.errors import InputError
 from sequences.images import encode_png
 from sequences.jsonfile import Node
@@ -126,6 +127,7 @@ class RunWriter:
             T_world_visit=np.eye(4) if T_world_visit is None else T_world_visit,
             catalogue=self._catalogue,
             depth_scale=self._depth_scale,
+            source=self._source,
         )
         self._visits[scene_id] = visit
         return visit
@@ -189,6 +191,7 @@ class VisitWriter:
     T_world_visit: Array
     catalogue: Catalogue
     depth_scale: float
+    source: str
     cameras: list[Camera] = field(default_factory=list)
     _frames: Json = field(default_factory=dict)
     _detections: list[Json] = field(default_factory=list)
@@ -235,7 +238,8 @@ class VisitWriter:
             **self._pose_json(T_world_camera),
             "timestamp_ns": int(time_ns),
         }
-        self._detections += [_detection_json(d, self.scene_id, im_id, self.catalogue) for d in detections]
+        obj_ids = self.catalogue.obj_ids
+        self._detections += [detection_json(d, self.scene_id, im_id, obj_ids, self.source) for d in detections]
         if truth is not None:
             self._truth_cameras[key] = self._pose_json(truth.T_world_camera)
             self._truth[key] = [_sighting_json(s, truth.T_world_camera) for s in truth.sightings]
@@ -312,18 +316,6 @@ def _model_json(c: ObjectClass) -> Json:
             {"axis": s.axis.tolist(), "offset": (s.offset / layout.MM).tolist()} for s in c.symmetries_continuous
         ]
     return out
-
-
-def _detection_json(detection: Detection, scene_id: int, im_id: int, catalogue: Catalogue) -> Json:
-    best = int(np.argmax(detection.class_scores[1:]))
-    return {
-        "scene_id": scene_id,
-        "image_id": im_id,
-        "category_id": catalogue.obj_ids[best],
-        "bbox": [float(value) for value in detection.box],
-        "score": float(detection.class_scores[1 + best]),
-        "class_scores": detection.class_scores.tolist(),
-    }
 
 
 def _visibility_json(sighting: Sighting) -> Json:

@@ -120,6 +120,10 @@ class DetectorConfig:
 
     noise: float = option(1.0, "scales every imperfection; 0 is a perfect detector", low=0.0, high=4.0)
     furniture: bool = option(True, "whether tables and shelves are detected too")
+    confusions: tuple[tuple[str, str], ...] = option(
+        (("loofah", "bowl"), ("milk_carton", "shampoo_bottle")),
+        "names of classes that are taken for each other; the others are for what looks like them",
+    )
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,14 @@ from sequences.progress import SILENT, Progress, Stage
 from sequences.rendering.scene import SceneImages, render_scene
 from sequences.seeds import generator
 from sequences.simulation.config import SensorConfig, SimulationConfig
-from sequences.simulation.detections import Detector
+from sequences.simulation.detections import Detector, Surroundings
 from sequences.simulation.lighting import LitScene, light, photograph
 from sequences.simulation.localisation import recorded_poses
 from sequences.simulation.motion import Arrangement, Visit, arrange
 from sequences.simulation.place import Place, Placed, furnish
 from sequences.simulation.sensor import DepthSensor, measure_colour
 from sequences.simulation.shapes import Shape, catalogue
-from sequences.simulation.surfaces import EXACT, Surfaces, surface_error
+from sequences.simulation.surfaces import EXACT, SurfaceError, Surfaces, surface_error
 from sequences.simulation.visibility import Thing, Visible, look
 from sequences.writing import FrameTruth, RunWriter, Sighting, VisitWriter
 
@@ -79,8 +80,8 @@ def _simulate_visit(
         for k in frames:
             T = visit.T_world_camera[k]
             rng = generator(seed, f"simulation.sensor.{v}", keyframe=k)
-            images, visible = scene.look(camera, T)
-            depth = sensor.measure(scene.surfaces.view(images, camera, T), rng)
+            glimpse = scene.look(camera, T)
+            depth = sensor.measure(scene.surfaces.view(glimpse.images, camera, T), rng)
             colour = photograph(scene.lit, camera, T, config.sensor.antialias)
             writer.add_frame(
                 im_id=k + 1,
@@ -89,8 +90,8 @@ def _simulate_visit(
                 T_world_camera=recorded[k],
                 depth=depth,
                 colour=measure_colour(colour, config.sensor, rng),
-                detections=detector.detect(k, [one for one in visible if one.inst_id not in scene.disguised]),
-                truth=FrameTruth(T, scene.sightings(visible)),
+                detections=detector.detect(k, glimpse.recognisable, glimpse.around),
+                truth=FrameTruth(T, scene.sightings(glimpse.visible)),
             )
             stage.advance()
     for move in visit.moves:
@@ -108,17 +109,65 @@ def _known_classes(place: Place, config: SimulationConfig) -> Catalogue:
 
 
 @dataclass(frozen=True)
+class Glimpse:
+    """What an image shows, before any sensor or detector."""
+
+    images: SceneImages
+    visible: tuple[Visible, ...]
+    """what the truth knows, shown or not"""
+    recognisable: tuple[Visible, ...]
+    """those that look as in the catalogue"""
+    around: Surroundings
+
+
+@dataclass(frozen=True)
+class Watched:
+    """All that detectors get to see of a place."""
+
+    classes: Catalogue
+    obj_ids: Mapping[int, int]
+    """inst_id -> obj_id of all that the truth knows"""
+    visits: tuple[tuple[int, Iterator[Glimpse]], ...]
+    """the number of images of each visit, and what they show, drawn when asked for and not kept"""
+
+
+def watch_place(config: SimulationConfig, seed: int, shapes: Sequence[Shape] | None = None) -> Watched:
+    """What shows in each image of the place that `simulate_place` writes: no depth is measured, no colour drawn."""
+    place = furnish(config.place, seed, shapes)
+    known = {i: shape.object_class.obj_id for i, shape in _in_catalogue(place, config).items()}
+    visits = tuple(
+        (len(visit.times_ns), _watch_visit(place, visit, known, config, seed, v))
+        for v, visit in enumerate(arrange(place, config, seed))
+    )
+    return Watched(_known_classes(place, config), known, visits)
+
+
+def _watch_visit(
+    place: Place, visit: Visit, known: Mapping[int, int], config: SimulationConfig, seed: int, v: int
+) -> Iterator[Glimpse]:
+    for arrangement, frames in visit.episodes():
+        scene = _Scene.of(place, visit, arrangement, known, config.sensor, seed, v)
+        for k in frames:
+            yield scene.look(config.sensor.camera, visit.T_world_camera[k])
+
+
+@dataclass(frozen=True)
 class _Scene:
     """What stands still from one nudge to the next, ready to be drawn and measured from anywhere."""
 
+    place: Place
+    bodies: tuple[Placed, ...]
+    """all that stands there, what the truth knows first"""
     known: tuple[Placed, ...]
     """what the truth knows"""
+    clutter: frozenset[int]
+    """inst_ids of what nobody modelled"""
     obj_ids: Mapping[int, int]
     supports: Mapping[int, int | None]
     disguised: frozenset[int]
     """inst_ids of what doesn't look as in the catalogue"""
-    lit: LitScene
-    surfaces: Surfaces
+    errors: tuple[SurfaceError, ...]
+    """of the bodies' depth"""
 
     @classmethod
     def of(
@@ -135,31 +184,59 @@ class _Scene:
         bodies = (*arrangement.things, *visit.furniture, *arrangement.clutter)
         bodies = tuple(sorted(bodies, key=lambda p: p.inst_id not in obj_ids))  # known ones are drawn first
         known = tuple(p for p in bodies if p.inst_id in obj_ids)
-        items = [*((p.body.mesh, p.T_world_object) for p in bodies), (place.room.mesh, np.eye(4))]
-        gloss = [*(p.body.gloss for p in bodies), 0.0]
-        lamp = np.append(place.layout.size / 2.0, LAMP_HEIGHT_M)
-        errors = [surface_error(p.inst_id, _extent_m(p.body.mesh), config, seed, v) for p in bodies]
         supports = {p.inst_id: place.support(p) for p in known}
         return cls(
+            place=place,
+            bodies=bodies,
             known=known,
+            clutter=frozenset(p.inst_id for p in arrangement.clutter),
             obj_ids=obj_ids,
             supports={i: s if s in obj_ids else None for i, s in supports.items()},
             disguised=frozenset(
                 p.inst_id for p in known if p.body.mesh is not place.known[p.inst_id].object_class.mesh
             ),
-            lit=light(items, lamp, place.room.window, gloss),
-            surfaces=Surfaces(items, gloss, [*errors, EXACT]),
+            errors=tuple(surface_error(p.inst_id, _extent_m(p.body.mesh), config, seed, v) for p in bodies),
         )
 
-    def look(self, camera: Camera, T_world_camera: Array) -> tuple[SceneImages, list[Visible]]:
-        """What a camera really sees, and what shows of each thing that the truth knows."""
+    @cached_property
+    def items(self) -> tuple[tuple[Mesh, Array], ...]:
+        """All that is drawn, with T_world_object (4, 4): the bodies, then the room."""
+        return (*((p.body.mesh, p.T_world_object) for p in self.bodies), (self.place.room.mesh, np.eye(4)))
+
+    @cached_property
+    def gloss(self) -> tuple[float, ...]:
+        """Of the items."""
+        return (*(p.body.gloss for p in self.bodies), 0.0)
+
+    @cached_property
+    def lit(self) -> LitScene:
+        """Ready for the colour camera."""
+        lamp = np.append(self.place.layout.size / 2.0, LAMP_HEIGHT_M)
+        return light(self.items, lamp, self.place.room.window, self.gloss)
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """Ready for the depth sensor."""
+        return Surfaces(self.items, self.gloss, [*self.errors, EXACT])
+
+    def look(self, camera: Camera, T_world_camera: Array) -> Glimpse:
+        """What a camera really sees."""
         T_camera_world = se3.inverse(T_world_camera)
-        images = render_scene([(mesh, T_camera_world @ T) for mesh, T in self.lit.items], camera)
+        images = render_scene([(mesh, T_camera_world @ T) for mesh, T in self.items], camera)
         things = [
-            Thing(p.inst_id, self.obj_ids[p.inst_id], p.body.mesh, T_camera_world @ p.T_world_object)
-            for p in self.known
+            Thing(p.inst_id, self.obj_ids.get(p.inst_id, 0), p.body.mesh, T_camera_world @ p.T_world_object)
+            for p in self.bodies
         ]
-        return images, look(things, images.item, camera)
+        seen = look(things, images.item, camera)
+        visible = tuple(seen[: len(self.known)])
+        around = Surroundings(
+            camera,
+            T_world_camera,
+            images.depth,
+            images.item >= len(self.known),
+            [v for v in seen if v.inst_id in self.clutter],
+        )
+        return Glimpse(images, visible, tuple(v for v in visible if v.inst_id not in self.disguised), around)
 
     def sightings(self, visible: Sequence[Visible]) -> tuple[Sighting, ...]:
         """The truth of one image."""
