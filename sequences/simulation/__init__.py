@@ -1,4 +1,4 @@
-"""Simulated runs: a room's corner, things in it that move between visits, a robot's camera, a sensor and a detector.
+"""Simulated runs: rooms, things in them that move between visits, a robot's camera, a sensor and a detector.
 
 Where a result comes from such a run it is called synthetic.
 """
