@@ -25,7 +25,7 @@ from sequences.rendering.scene import SceneImages, render_scene
 
 Array = NDArray[np.float64]
 
-CREASE_RAD = 0.7  # faces that meet at a sharper edge are not shaded as one smooth surface
+CREASE_RAD = 0.8  # faces that meet at a sharper edge are not shaded as one smooth surface
 LAMP_RADIUS_M = 0.35
 LAMP_SAMPLES = 18
 WINDOW_SAMPLES = 12

@@ -169,10 +169,14 @@ def puff(size: ArrayLike, swell: Callable[[Array], Array], rings: int = 18, segm
     return vertices, _tube_faces(rings, segments)
 
 
-def block(size: ArrayLike, at: ArrayLike = (0.0, 0.0, 0.0)) -> Solid:
-    """A sharp-edged box of 12 faces, for keys, legs and the like."""
+def block(
+    size: ArrayLike,
+    at: ArrayLike = (0.0, 0.0, 0.0),
+    cuts: tuple[Sequence[float], Sequence[float], Sequence[float]] = ((), (), ()),
+) -> Solid:
+    """A sharp-edged box about a point, for keys, legs and the like; `cuts` are those of `rounded_box`."""
     half = np.asarray(size, dtype=np.float64) / 2.0
-    return moved(_box_grid([np.array([-h, h]) for h in half]), at)
+    return moved(_box_grid([np.array([-h, *cut, h]) for h, cut in zip(half, cuts, strict=True)]), at)
 
 
 def scored(solid: Solid, axis: int | ArrayLike, places: Sequence[float]) -> Solid:

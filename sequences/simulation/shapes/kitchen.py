@@ -65,9 +65,9 @@ def plate() -> Mesh:
     inside = [[0.088, 0.0122], [0.082, 0.0095], [0.077, 0.0078], [0.0, 0.0072]]
     white, blue = (240, 240, 236), (54, 78, 140)
 
-    def line(vertices: Array) -> NDArray[np.bool_]:
-        r = np.hypot(vertices[:, 0], vertices[:, 1])
-        return (r < 0.1153) & (r > 0.1106) & (vertices[:, 2] > 0.0203) & (vertices[:, 2] < 0.0224)
+    def line(points: Array) -> NDArray[np.bool_]:
+        above = np.hypot(points[:, 0], points[:, 1]) < 0.118
+        return above & (points[:, 2] > 0.0205) & (points[:, 2] < 0.0222)
 
     return assemble([(lathe([*under, *rim, *well, *inside], 40), printed(white, (line, blue)))])
 

@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull
 
 from sequences import se3
 from sequences.camera import Camera
+from sequences.meshes import simplify
 from sequences.rendering.scene import render_scene
 from sequences.simulation.shapes import Body, Shape, catalogue, clothed, clutter, household
 from sequences.simulation.solids import rotation
@@ -22,10 +23,14 @@ CLUTTER = clutter()
 every_shape = pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.object_class.name)
 
 
-def moved_by(shape: Shape, T: np.ndarray) -> float:
-    """How far a motion takes the surface from itself, metres, by 250 of its vertices."""
+def moved_by(shape: Shape, T: np.ndarray, middles: bool = False) -> float:
+    """How far a motion takes the surface from itself, metres, by 250 of its vertices or of the middles of its faces.
+
+    The middles lie everywhere; the vertices alone are exact where a rounded corner's faces are cut the other way.
+    """
     mesh = shape.object_class.mesh
-    some = np.random.default_rng(0).permutation(mesh.vertices)[:250]
+    points = mesh.vertices[mesh.faces].mean(axis=1) if middles else mesh.vertices
+    some = np.random.default_rng(0).permutation(points)[:250]
     return float(distances(se3.transform(T, some), mesh.vertices, mesh.faces).max())
 
 
@@ -65,7 +70,7 @@ def test_meshes_are_closed_solids_of_moderate_size(shape):
     assert solid.volume > 0
     assert solid.area_faces.min() > 0
     assert mesh.is_solid
-    assert 300 <= len(mesh.faces) <= (1800 if shape.object_class.movable else 4200)
+    assert 300 <= len(mesh.faces) <= (1800 if shape.object_class.movable else 1000)
     assert len(np.unique(mesh.colours, axis=0)) >= 2
 
 
@@ -101,7 +106,7 @@ def test_no_symmetry_is_left_out(shape):
         stated += [R @ se3.so3_exp(k * np.pi / 2 * axis) for R in stated for k in (1, 2, 3)]
     for R in cube_rotations():
         if not any(np.allclose(R, S, atol=1e-9) for S in stated):
-            assert moved_by(shape, se3.make(R, np.zeros(3))) > 1e-3
+            assert moved_by(shape, se3.make(R, np.zeros(3)), middles=True) > 1e-3
 
 
 def least_margin(body: Body, R: np.ndarray) -> float:
@@ -208,6 +213,14 @@ def test_nothing_of_the_top_shows_through_its_cloth(name):
     camera = Camera(150.0, 150.0, 119.5, 79.5, 240, 160)
     face = render_scene([(covered.mesh, se3.inverse(look))], camera).face
     assert (face[face >= 0] >= len(covered.object_class.mesh.faces)).all()
+
+
+@every_shape
+def test_coarse_copies_keep_their_form(shape):
+    mesh = shape.object_class.mesh
+    coarse = simplify(mesh, 500)
+    some = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), 150, seed=0)[0]
+    assert distances(np.asarray(some), coarse.vertices, coarse.faces).max() < 0.015 * shape.object_class.diameter_m
 
 
 def test_the_measures_of_distance_and_inside_are_right():
