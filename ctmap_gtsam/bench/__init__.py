@@ -11,7 +11,7 @@ from ctmap_gtsam.runtime.versions import versions
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
 
-BENCHES = {"realism": "ctmap_gtsam.bench.realism", "render": "ctmap_gtsam.bench.render"}
+BENCHES = {name: f"ctmap_gtsam.bench.{name}" for name in ("detector", "realism", "render")}
 """Name -> module"""
 
 

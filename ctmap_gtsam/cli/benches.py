@@ -112,6 +112,29 @@ def realism(
     _figures("realism", json_file, config_file, assignments, seed, data=data, out=folder)
 
 
+@bench_app.command()
+def detector(
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="SET", help="Places: tuning, reported, or seeds such as 0-4,7.")
+    ] = "tuning",
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """The simulated detector's mAP against its knob on the paper's benchmark, and the knob for the paper's mAP.
+
+    Only what shows is drawn, so twenty places take minutes. The settings are the benchmark's, unless --config gives
+    others; the knob goes into [simulation.detector] of what is to use it.
+
+    Example: `ctmap bench detector --seeds 0-4`
+    """
+    from ctmap_gtsam.bench.paper import SETTINGS, load_protocol
+
+    chosen = load_protocol().seeds(seeds)
+    _figures("detector", json_file, config_file or SETTINGS, assignments, seed, seeds=chosen)
+
+
 def _figures(
     name: str,
     json_file: Path | None,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.bench.realism.planes import Z_BINS_M, Patches
-from ctmap_gtsam.bench.realism.residuals import Glance, autocorrelation, figures, finite, robust_sigma
+from ctmap_gtsam.bench.realism.residuals import Glance, autocorrelation, figures, finite, robust_sigma, standardised
 from sequences.atomic import write_bytes
 from sequences.simulation.config import FOCAL_PX
 from sequences.simulation.sensor import BASELINE_M
@@ -113,7 +113,7 @@ def _tails(axes: Axes, measured: Sequence[Measured]) -> None:
     x = np.linspace(0.0, 10.0, 101)
     for m in measured:
         if m.glances:
-            standard = np.concatenate([_standard(finite(g.refitted)) for g in m.glances])
+            standard = np.concatenate([standardised(finite(g.refitted)) for g in m.glances])
             beyond = [(np.abs(standard) > limit).mean() for limit in x]
             colour, line, _ = STYLES[m.name]
             axes.plot(x, beyond, color=colour, linestyle=line, linewidth=2)
@@ -123,10 +123,6 @@ def _tails(axes: Axes, measured: Sequence[Measured]) -> None:
     axes.text(2.9, 3e-4, "normal", color="0.4", fontsize=8)
     axes.set(yscale="log", ylim=(1e-4, 1.0), xlim=(0.0, 10.0), xlabel="robust sigmas of the object in its frame")
     axes.set_title("tails: share of pixels beyond")
-
-
-def _standard(residual: Array) -> Array:
-    return (residual - np.median(residual)) / robust_sigma(residual)
 
 
 def _correlation(axes: Axes, measured: Sequence[Measured]) -> None:

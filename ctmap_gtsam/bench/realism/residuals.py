@@ -37,6 +37,7 @@ LEAST_COSINE = 0.3  # below, a pose's error moves depth by more than a linear re
 REFIT_RAD, REFIT_M = 0.05, 0.01  # sigma of the refit's prior
 REFIT_ROUNDS = 9
 CUTOFF = 4.0  # Tukey's biweight, robust sigmas
+LEAST_SIGMA_M = 1e-6
 LEAST_SPOTS = 30
 FAR = 10.0  # robust sigmas: what is further off would decide a kurtosis alone
 SPOT_M = 0.003  # edge of the cells in which spots of a surface are compared between frames
@@ -202,6 +203,11 @@ def robust_sigma(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
+def standardised(values: Array) -> Array:
+    """(n,) distances from the median in robust sigmas."""
+    return (values - np.median(values)) / max(robust_sigma(values), LEAST_SIGMA_M)
+
+
 def finite(values: Array) -> Array:
     """Those that aren't NaN, (n,)."""
     return values[np.isfinite(values)]
@@ -211,7 +217,7 @@ def figures(some: Sequence[Glance]) -> dict[str, float]:
     """All figures of one recording; lengths in millimetres, shares of pixels. See the module and docs/benchmarks.md."""
     refitted = [finite(g.refitted) for g in some]
     whole = np.concatenate(refitted)
-    standard = np.concatenate([(r - np.median(r)) / robust_sigma(r) for r in refitted])
+    standard = np.concatenate([standardised(r) for r in refitted])
     near = standard[np.abs(standard) < FAR]
     out = {
         "z_m": float(np.mean([g.z for g in some])),
@@ -220,7 +226,7 @@ def figures(some: Sequence[Glance]) -> dict[str, float]:
         "spread_px": robust_sigma(np.concatenate([finite(g.refitted) * g.pixels_per_metre for g in some])),
         "beyond_5_mm": float((np.abs(whole - np.median(whole)) > 0.005).mean()),
         "beyond_3_sigma": float((np.abs(standard) > 3.0).mean()),
-        "kurtosis": float((near**4).mean() / (near**2).mean() ** 2),
+        "kurtosis": float((near**4).mean() / max((near**2).mean() ** 2, 1e-30)),
         "holes_interior": _share([g.hole for g in some], [g.interior for g in some]),
         "holes_edge": _share([g.hole for g in some], [g.band for g in some]),
         "flying_edge": _share([g.flying for g in some], [g.band & ~g.hole for g in some]),
@@ -248,7 +254,7 @@ def autocorrelation(some: Sequence[Glance], lags: Sequence[int]) -> list[float]:
     """Of refitted residuals, so many pixels apart along rows and columns; NaN where no object is as large."""
     maps = [g.refitted - np.nanmedian(g.refitted) for g in some]
     # a single far point must not decide
-    limits = [CUTOFF * robust_sigma(finite(m)) for m in maps]
+    limits = [CUTOFF * max(robust_sigma(finite(m)), LEAST_SIGMA_M) for m in maps]
     clipped = [np.clip(m, -limit, limit) for m, limit in zip(maps, limits, strict=True)]
     return [_correlation([p for m in clipped for p in _pairs(m, lag)]) for lag in lags]
 
@@ -291,7 +297,7 @@ def lasting(some: Sequence[Glance]) -> float:
 def _spots(g: Glance) -> dict[int, float]:
     """Mean residual of each cell of the surface, cut at CUTOFF sigmas."""
     known = np.isfinite(g.refitted)
-    limit = CUTOFF * robust_sigma(g.refitted[known])
+    limit = CUTOFF * max(robust_sigma(g.refitted[known]), LEAST_SIGMA_M)
     cell = np.floor(g.points[known] / SPOT_M).astype(np.int64) @ np.array([1, 2048, 2048**2])
     names, member = np.unique(cell, return_inverse=True)
     mean = np.bincount(member, np.clip(g.refitted[known], -limit, limit)) / np.bincount(member)

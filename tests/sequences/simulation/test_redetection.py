@@ -108,7 +108,7 @@ def test_all_files_or_none(tmp_path):
     first.parent.mkdir()
     first.write_text("old")
     second.write_text("a file where a folder is needed")
-    with pytest.raises(OSError, match="exists|directory"):
+    with pytest.raises(OSError, match=r"exists|directory"):
         write_together({first: b"new", second / "two.json": b"new"})
     assert first.read_text() == "old"
     assert sorted(p.name for p in first.parent.iterdir()) == ["one.json"]

@@ -27,7 +27,7 @@ def test_the_field_is_as_large_and_as_smooth_as_asked():
     error = surface_error(3, 0.2, config, 0, 0)
     here = error.at(points)
     assert robust_sigma(here) == pytest.approx(0.002, rel=0.2)
-    near, far = error.at(points + [0.004, 0.0, 0.0]), error.at(points + [0.2, 0.0, 0.0])
+    near, far = (error.at(points + np.array([x, 0.0, 0.0])) for x in (0.004, 0.2))
     assert np.corrcoef(here, near)[0, 1] > 0.9
     assert abs(np.corrcoef(here, far)[0, 1]) < 0.2
 
