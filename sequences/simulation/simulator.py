@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -60,13 +61,21 @@ def simulate_place(
     with (
         RunWriter(out, classes, source=SOURCE, up_world=UP, localisation=config.localisation.noise) as writer,
         progress.stage("simulate", total=len(visits) * config.trajectory.frames) as stage,
+        ThreadPoolExecutor(1) as painter,
     ):
         for k, visit in enumerate(visits):
-            _simulate_visit(writer.add_visit(k + 1), place, visit, config, seed, k, stage)
+            _simulate_visit(writer.add_visit(k + 1), place, visit, config, seed, k, stage, painter)
 
 
 def _simulate_visit(
-    writer: VisitWriter, place: Place, visit: Visit, config: SimulationConfig, seed: int, v: int, stage: Stage
+    writer: VisitWriter,
+    place: Place,
+    visit: Visit,
+    config: SimulationConfig,
+    seed: int,
+    v: int,
+    stage: Stage,
+    painter: Executor,
 ) -> None:
     camera, classes = config.sensor.camera, _known_classes(place, config)
     noise = config.localisation.noise
@@ -80,16 +89,16 @@ def _simulate_visit(
         for k in frames:
             T = visit.T_world_camera[k]
             rng = generator(seed, f"simulation.sensor.{v}", keyframe=k)
+            colour = painter.submit(photograph, scene.lit, camera, T, config.sensor.antialias)  # half of all the work
             glimpse = scene.look(camera, T)
             depth = sensor.measure(scene.surfaces.view(glimpse.images, camera, T), rng)
-            colour = photograph(scene.lit, camera, T, config.sensor.antialias)
             writer.add_frame(
                 im_id=k + 1,
                 time_ns=visit.start_ns + int(visit.times_ns[k]),
                 camera=camera,
                 T_world_camera=recorded[k],
                 depth=depth,
-                colour=measure_colour(colour, config.sensor, rng),
+                colour=measure_colour(colour.result(), config.sensor, rng),
                 detections=detector.detect(k, glimpse.recognisable, glimpse.around),
                 truth=FrameTruth(T, scene.sightings(glimpse.visible)),
             )
