@@ -51,6 +51,8 @@ EDGE_STEP = 0.02  # neighbours whose depths differ by this share are an edge
 WINDOW_REACH_PX = 0.8  # the window changes disparity by up to about half of this; across a step one side wins
 DIM = 0.04  # light that comes back, as a share of a white surface's at 1 m, below which measuring gets hard
 UNSURE = 4.5  # how much noisier, as a power of e, depth is that is a standard deviation nearer to being lost
+SELDOM = -2.7  # how far well-lit surfaces are from being lost, standard deviations of the patches that are
+AT_EDGES = 2.4  # how much nearer to it depth edges are
 HOLE_PX = 2.5  # over how many pixels of the sensor depth is lost together
 UNEVEN_OVER = 3.0  # the noise's size changes over so many times the length over which the noise does
 MIRROR_RAD = 0.16  # how far from the mirror direction a glossy surface still dazzles the sensor
@@ -98,16 +100,17 @@ class DepthSensor:
         disparity = np.where(z > 0.0, STRENGTH / np.where(z > 0.0, z + amount * error, 1.0), 0.0)
         disparity = _rounded(disparity, c.window_px * scale)
         angle, mirror, light = _light(view, at)
-        edge = _edges(view.depth, max(1, round(scale * c.edge_px)))
-        tendency = _tendency_to_be_lost(edge, angle, mirror, light, view.gloss[at])
-        poor = amount * _patches(z.shape, HOLE_PX * scale, rng) + tendency
+        poor = amount * _patches(z.shape, HOLE_PX * scale, rng) + _tendency_to_be_lost(
+            angle, mirror, light, view.gloss[at]
+        )
+        torn = AT_EDGES * _edges(view.depth, max(1, round(scale * c.edge_px)))
         noise = _uneven(z.shape, c.correlation_px * scale, c.unevenness, rng)
         noise *= c.disparity_sigma_px * _noise_factor(angle, light, poor)
         disparity += amount * (noise + self._distortion)
         step = min(1.0, c.depth_noise) * c.quantisation_px
         if step > 0.0:
             disparity = np.rint(disparity / np.float32(step)) * np.float32(step)
-        seen = (z > 0.0) & (disparity > 0.0) & (poor < 0.0) & lit_by_projector(view.depth, scale)
+        seen = (z > 0.0) & (disparity > 0.0) & (poor + torn < 0.0) & lit_by_projector(view.depth, scale)
         measured = np.where(seen, STRENGTH / np.where(seen, disparity, 1.0), 0.0)
         in_range = (measured > RANGE_M[0]) & (measured < RANGE_M[1])
         return np.where(in_range, measured, 0.0).astype(np.float32)
@@ -220,12 +223,12 @@ def _edges(depth: Depth, reach: int) -> NDArray[np.bool_]:
     return np.asarray(high - low > EDGE_STEP * reach * np.maximum(high, 0.1))
 
 
-def _tendency_to_be_lost(edge: NDArray[np.bool_], angle: Field, mirror: Field, light: Field, gloss: Field) -> Field:
-    """(h, w) in standard deviations of the patches in which depth is lost."""
+def _tendency_to_be_lost(angle: Field, mirror: Field, light: Field, gloss: Field) -> Field:
+    """(h, w) in standard deviations of the patches in which depth is lost, 0 where half of it is."""
     grazing = 14.0 * np.maximum(angle - GRAZING_RAD, 0.0)
     dark = 1.5 * np.log(np.maximum(DIM / light, 1.0))
     dazzled = 6.0 * gloss * np.exp(-((mirror / MIRROR_RAD) ** 2))
-    return np.asarray(-2.7 + 2.4 * edge.astype(np.float32) + grazing + dark + dazzled)
+    return np.asarray(SELDOM + grazing + dark + dazzled)
 
 
 def measure_colour(exact: NDArray[np.uint8], config: SensorConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
