@@ -253,6 +253,14 @@ def test_the_ceiling_closes_the_gap_and_the_detector_none_of_it(tmp_path):
     assert rows["detector"]["figures"]["map_50_paper"] < rows[CEILING]["figures"]["map_50_paper"]
 
 
+def test_one_place_has_figures_and_no_intervals(tmp_path):
+    result = run(tmp_path, seeds=(1,)).result
+    for row in (*result["rows"], *result["differences"]):
+        assert row["figures"]["map_50_paper"] is not None
+        assert row["intervals"] == {}
+    assert all(row["gap_closed"]["interval"] is None for row in result["rows"])
+
+
 def test_repeats_are_other_draws_of_the_same_places(tmp_path):
     once, twice = run(tmp_path), run(tmp_path, repeats=2)
     a, b = ({r["method"]: r for r in o.result["rows"]} for o in (once, twice))

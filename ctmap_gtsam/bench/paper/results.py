@@ -87,7 +87,7 @@ class Results:
             by_seed = self._records[key]
             places = [by_seed[seed] if seed in seeds else () for seed in self._seeds]
             with self._progress.stage(f"draw places for {' '.join(key)}") as stage:
-                drawn = redrawn(pooled, places, self._drawn)
+                drawn = redrawn(pooled, places, self._drawn) if len(seeds) > 1 else {}  # one place tells no spread
                 self._rows[key, seeds] = Row(pooled([r for some in places for r in some]), drawn)
                 stage.advance()
         return self._rows[key, seeds]
@@ -112,6 +112,8 @@ class Results:
         if any(value is None for value in values) or values[2] == values[1]:
             return None
         at, start, end = (float(value) for value in values if value is not None)
+        if metric not in row.drawn:
+            return (at - start) / (end - start), None
         span = high.drawn[metric] - low.drawn[metric]
         share = np.divide(
             row.drawn[metric] - low.drawn[metric], span, out=np.full_like(span, np.nan), where=span != 0.0
