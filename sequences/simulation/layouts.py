@@ -97,9 +97,10 @@ def _spread(layout: Layout) -> float:
 
 def _try(sizes: Sequence[Array], rng: np.random.Generator) -> Layout | None:
     room = rng.uniform(ROOM_M[0], ROOM_M[1])
+    walls = [_wall(which, room) for which in range(3)]
     pieces: list[_Piece] = []
     for size in sizes:
-        options = (_somewhere(room, size, rng) for _ in range(TRIES_EACH))
+        options = (_somewhere(walls, room, size, rng) for _ in range(TRIES_EACH))
         piece = next((p for p in options if all(_go_together(p, other) for other in pieces)), None)
         if piece is None:
             return None
@@ -126,13 +127,15 @@ def _wall(which: int, room: Array) -> Array:
     return se3.make(rotation("z", turn), np.array([*corner, 0.0]))
 
 
-def _somewhere(room: Array, size: Array, rng: np.random.Generator) -> _Piece:
-    """A piece anywhere along a wall."""
-    wall = int(rng.choice(3, p=(0.5, 0.25, 0.25)))
+def _somewhere(walls: Sequence[Array], room: Array, size: Array, rng: np.random.Generator) -> _Piece:
+    """A piece anywhere along a wall, the back wall rather than the others."""
+    which, share, gap = rng.random(3)
+    wall = (1 if which < 0.25 else 2) if which < 0.5 else 0
     length = room[0] if wall == 0 else room[1]
-    x = rng.uniform(size[0] / 2, length - size[0] / 2)
-    at = np.array([x, -rng.uniform(*WALL_GAP_M) - size[1] / 2, size[2] / 2])
-    T = _wall(wall, room) @ se3.make(np.eye(3), at)
+    x = size[0] / 2 + share * (length - size[0])
+    y = -WALL_GAP_M[0] - gap * (WALL_GAP_M[1] - WALL_GAP_M[0]) - size[1] / 2
+    T = walls[wall].copy()
+    T[:3, 3] += T[:3, :3] @ (x, y, size[2] / 2)
     return _Piece(wall, T, _box(T, size), _box(T, size, FRONT_M))
 
 
@@ -144,7 +147,7 @@ def _box(T: Array, size: Array, front: float = 0.0) -> Array:
 
 def _gap(a: Array, b: Array) -> float:
     """Between two boxes along the axis that parts them; negative where they overlap."""
-    return float(np.maximum(a[0] - b[1], b[0] - a[1]).max())
+    return float(max(a[0, 0] - b[1, 0], b[0, 0] - a[1, 0], a[0, 1] - b[1, 1], b[0, 1] - a[1, 1]))
 
 
 def _go_together(a: _Piece, b: _Piece) -> bool:

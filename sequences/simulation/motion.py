@@ -31,7 +31,7 @@ Where = dict[int, Placed]
 """inst_id -> where it is, for what is in the place"""
 
 FIRST_VISIT_NS = 1_538_384_400_000_000_000  # 2018-10-01 09:00 UTC
-ATTEMPTS = 30  # at putting all things somewhere
+ATTEMPTS = 20  # at putting all things somewhere
 CLUTTER_PERSISTENCE_S = 24 * 3600.0
 NUDGE_M, NUDGE_RAD = (0.02, 0.06), (0.05, 0.4)  # how far things are pushed and turned
 NUDGES_TRIED, FRAMES_TRIED = 20, 4
@@ -89,24 +89,23 @@ def arrange(place: Place, config: SimulationConfig, seed: int) -> tuple[Visit, .
 
 def _stock(place: Place, config: SimulationConfig, seed: int) -> Where:
     """Put every thing somewhere, but for what is away: the large ones first, as people do, and clutter at last."""
-    missing: list[int] = []
+    without = ""
     for attempt in range(ATTEMPTS):
-        where, missing = _stocked(place, config, seed, attempt)
-        if not missing:
+        where, without = _stocked(place, config, seed, attempt)
+        if not without:
             return where
     raise InputError(
-        f"found no free spot for {place.known[missing[0]].object_class.name}, one of {len(place.stock)} objects",
+        f"found no free spot for {without}, one of {len(place.stock)} objects",
         field="place.objects",
         remedy="simulate fewer objects, or set a smaller place.clearance_m",
     )
 
 
-def _stocked(place: Place, config: SimulationConfig, seed: int, attempt: int) -> tuple[Where, list[int]]:
-    """Where things are, and inst_ids of those that found no place."""
+def _stocked(place: Place, config: SimulationConfig, seed: int, attempt: int) -> tuple[Where, str]:
+    """Where things are, and the name of the first that found no place, if any; clutter that finds none is left out."""
     bodies = place.loose
     away = 0.0 if config.motion.moves is not None else config.motion.away
     where: Where = {}
-    missing: list[int] = []
     for inst_id in sorted(bodies, key=lambda i: (i not in place.known, -_size(bodies[i].mesh.vertices))):
         if generator(seed, "simulation.away", inst_id).random() < away:
             continue
@@ -115,8 +114,8 @@ def _stocked(place: Place, config: SimulationConfig, seed: int, attempt: int) ->
         if placed is not None:
             where[inst_id] = placed
         elif inst_id in place.known:
-            missing.append(inst_id)
-    return where, missing
+            return where, place.known[inst_id].object_class.name
+    return where, ""
 
 
 def _size(vertices: Array) -> float:

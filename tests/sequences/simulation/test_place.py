@@ -18,7 +18,7 @@ from tests.sequences.simulation.solid_geometry import winding_numbers
 
 CONFIG = SimulationConfig(
     place=PlaceConfig(objects=12, clutter=4, cloth=0.5),
-    motion=MotionConfig(visits=3, gap_h=24.0, nudges=2),
+    motion=MotionConfig(visits=2, gap_h=48.0, nudges=2),
     trajectory=TrajectoryConfig(frames=5, period_s=2.0),
 )
 LIFT = np.array([0.0, 0.0, 1e-4])  # what stands on a surface touches it, which is neither in nor out
@@ -40,7 +40,7 @@ def everything(visit: Visit) -> list[tuple[list[Placed], list[Placed]]]:
     return [([*a.things, *a.clutter], list(visit.furniture)) for a in visit.arrangements]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_nothing_penetrates_anything(seed):
     for visit in arrange(furnish(CONFIG.place, seed), CONFIG, seed):
         for things, furniture in everything(visit)[::2]:
@@ -53,7 +53,7 @@ def test_nothing_penetrates_anything(seed):
                     assert not inside(world_vertices(piece) - LIFT, thing)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_everything_rests_on_its_surface_in_a_stable_pose(seed):
     place = furnish(CONFIG.place, seed)
     for visit in arrange(place, CONFIG, seed):
@@ -71,11 +71,11 @@ def test_everything_rests_on_its_surface_in_a_stable_pose(seed):
 
 
 def test_all_surfaces_are_used():
-    for seed in range(3):
+    for seed in range(2):
         place = furnish(CONFIG.place, seed)
         used = {
             thing.surface
-            for k in range(12)
+            for k in range(10)
             for thing in arrange(place, replace(CONFIG, motion=MotionConfig(visits=1)), k)[0].arrangements[0].things
         }
         assert used == set(range(len(place.surfaces)))
@@ -105,7 +105,7 @@ def test_a_room_keeps_what_belongs_there():
     for kind in ("kitchen", "bathroom", "study"):
         kept = KINDS[kind].kept
         categories = Counter(
-            s.object_class.category for seed in range(12) for s in furnish(PlaceConfig(kind=kind), seed).stock
+            s.object_class.category for seed in range(6) for s in furnish(PlaceConfig(kind=kind), seed).stock
         )
         assert categories.total() > sum(categories[c] for c in kept) > 0.6 * categories.total()
 
@@ -114,7 +114,7 @@ def neighbourhood(together: float) -> tuple[float, float]:
     """How much nearer than anything else things of one category are, and things of kin: ratios of mean distances."""
     apart: dict[str, list[float]] = {"same": [], "kin": [], "other": []}
     config = replace(CONFIG, place=PlaceConfig(together=together), motion=MotionConfig(visits=1))
-    for seed in range(40):
+    for seed in range(24):
         place = furnish(config.place, seed)
         things = arrange(place, config, seed)[0].arrangements[0].things
         for a, b in combinations(things, 2):
@@ -132,7 +132,7 @@ def test_things_of_a_category_stand_together_and_near_their_kin_with_exceptions(
 
 
 def test_a_place_that_is_too_full_is_refused():
-    config = replace(CONFIG, place=PlaceConfig(objects=40, clearance_m=0.1))
+    config = replace(CONFIG, place=PlaceConfig(objects=40, clearance_m=0.2))
     with pytest.raises(InputError, match="no free spot"):
         arrange(furnish(config.place, 0), config, 0)
 
