@@ -100,14 +100,15 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
 
     def wanted(i: int, k: int) -> Wanted | None:
         thing = current.things[i]
+        best = thing.best_class
         starts = {}
         for c in thing.possible(model):
-            near = [thing.pose_near(c, k)]
+            # what a keyframe has settled on may be wrong: the middle of its life has another say
+            near = [thing.pose_near(c, k), thing.anchor[None] if c == best and thing.anchor is not None else None]
             sighting = thing.sightings.get(k)
             if sighting is not None:
                 near.append(in_world(sighting, c, recording.T_world_camera(k)))
             starts[c] = np.concatenate([n for n in near if n is not None] or [np.zeros((0, 4, 4))])
-        best = thing.best_class
         pose = thing.pose_near(best, k)
         if pose is None:
             return None
