@@ -81,7 +81,7 @@ class SensorConfig:
     disparity_sigma_px: float = option(0.11, "noise of disparity, pixels: 2.6 mm at 1 m, 10 mm at 2 m", low=0.0)
     correlation_px: float = option(2.5, "over how many pixels noise is alike", low=0.0)
     unevenness: float = option(1.5, "how much the noise's size differs from place to place, heavy tails", low=0.0)
-    window_px: float = option(4.0, "over how many pixels the sensor averages within a surface", low=0.0)
+    window_px: float = option(3.0, "over how many pixels the sensor averages within a surface", low=0.0)
     distortion_px: float = option(0.07, "sigma of the camera's own distortion of disparity, pixels", low=0.0)
     distortion_length_px: float = option(80.0, "over how many pixels the distortion changes", low=8.0)
     lateral_sigma_px: float = option(0.7, "how far to the side depth is taken from, pixels", low=0.0)

@@ -48,7 +48,7 @@ STRENGTH = np.float32(FOCAL_PX * BASELINE_M)  # disparity at 1 m, pixels of the 
 RANGE_M = (0.35, 4.5)
 GRAZING_RAD = 1.2  # from this angle of incidence on, less and less light comes back
 EDGE_STEP = 0.02  # neighbours whose depths differ by this share are an edge
-WINDOW_REACH_PX = 0.8  # the window changes disparity by up to about half of this; across a step one side wins
+ONE_SURFACE_PX = 1.0  # what differs by more in disparity is hardly of one surface
 DIM = 0.04  # light that comes back, as a share of a white surface's at 1 m, below which measuring gets hard
 UNSURE = 4.5  # how much noisier, as a power of e, depth is that is a standard deviation nearer to being lost
 SELDOM = -2.7  # how far well-lit surfaces are from being lost, standard deviations of the patches that are
@@ -158,12 +158,14 @@ def _uneven(shape: tuple[int, ...], length: float, unevenness: float, rng: np.ra
 
 
 def _rounded(disparity: Field, window_px: float) -> Field:
-    """The mean over the window, wherever what it holds is one surface: edges and hollows lose their sharpness."""
+    """The mean over the window of what is one surface: edges and hollows lose their sharpness, steps don't.
+
+    A bilateral filter (Tomasi and Manduchi, ICCV 1998).
+    """
     if window_px <= 0.0:
         return disparity
     size = 2 * int(np.ceil(2.0 * window_px)) + 1
-    change = cv2.GaussianBlur(disparity, (size, size), window_px, borderType=cv2.BORDER_REPLICATE) - disparity
-    return disparity + change * np.exp(np.float32(-0.5) * (change / np.float32(WINDOW_REACH_PX)) ** 2)
+    return np.asarray(cv2.bilateralFilter(disparity, size, ONE_SURFACE_PX, window_px))
 
 
 def _light(view: View, at: tuple[NDArray[np.intp], NDArray[np.intp]]) -> tuple[Field, Field, Field]:
