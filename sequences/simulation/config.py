@@ -68,7 +68,7 @@ class TrajectoryConfig:
     frames: int = option(26, "images of each visit", low=1)
     period_s: float = option(0.5, "seconds between two images", low=0.001)
     height_m: float = option(1.2, "of the camera above the floor, a head's; metres", low=0.9, high=1.6)
-    distance_m: float = option(1.3, "from the camera to what it looks at, more or less; metres", low=0.8, high=1.8)
+    distance_m: float = option(1.0, "from the camera to what it looks at, more or less; metres", low=0.8, high=1.8)
 
 
 @dataclass(frozen=True)
