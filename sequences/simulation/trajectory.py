@@ -116,11 +116,11 @@ def _stop(place: Place, piece: Placed, eye: Array, config: TrajectoryConfig, rng
     middles = np.stack([s.T_world_area[:3, 3] for s in surfaces])
     T, width = surfaces[0].T_world_area, max(float(s.size[0]) for s in surfaces)
     centre = np.append(middles[:, :2].mean(axis=0), 0.0)
-    low, high = middles[:, 2].min(), middles[:, 2].max() + 0.1
-    side = rng.choice([-1.0, 1.0])
+    low, high = middles[:, 2].min() + 0.05, middles[:, 2].max() + 0.05
+    side, upside = rng.choice([-1.0, 1.0], 2)
     looks = []
     for end in (-side, side):
-        height = rng.uniform(low, high) if high - low > 0.3 else low + 0.05
+        height = (low + high) / 2.0 + end * upside * rng.uniform(0.1, 0.5) * (high - low)
         target = centre + end * SWEEP * width * T[:3, 0] + [0.0, 0.0, height]
         turn = rng.uniform(0.0, 2.0 * np.pi)
         eye = _stand(place, T, target, eye + DRIVE_M * np.array([np.cos(turn), np.sin(turn)]), config, rng)
