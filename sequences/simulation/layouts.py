@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sequences import se3
+from sequences.errors import InputError
 from sequences.simulation.solids import rotation
 
 Array = NDArray[np.float64]
@@ -81,11 +82,18 @@ def lay_out(sizes: Sequence[Array], rng: np.random.Generator) -> Layout:
     Args:
         sizes: (3,) bounding box of each piece, metres; its back is at +y.
         rng: draws all of it.
+
+    Raises:
+        InputError: they fit in no room.
     """
     found = (_try(sizes, rng) for _ in range(TRIES))
     layouts = list(islice((layout for layout in found if layout is not None), CHOICE))
     if not layouts:
-        raise ValueError(f"found no way to stand {len(sizes)} pieces of furniture in a room")
+        raise InputError(
+            f"found no room in which {len(sizes)} pieces of furniture stand and a robot can pass",
+            field="catalogue",
+            remedy="give a catalogue with smaller furniture, or one that leaves it to the simulator",
+        )
     return min(layouts, key=_spread)
 
 

@@ -94,6 +94,7 @@ class Place:
     """category -> position in `spots` where such things usually stand"""
     layout: Layout
     seed: int
+    """the room's looks come from it"""
 
     @cached_property
     def room(self) -> Room:
@@ -275,7 +276,6 @@ def _box(piece: Placed) -> Array:
 
 def _surfaces(furniture: int, piece: Placed) -> list[Surface]:
     areas = _shape_of(piece).areas
-    top = max(area.centre[2] for area in areas)
     return [
         Surface(
             furniture=furniture,
@@ -285,7 +285,6 @@ def _surfaces(furniture: int, piece: Placed) -> list[Surface]:
             open=len({a.centre[2] for a in areas}) == 1,
         )
         for area in areas
-        if area.centre[2] <= top
     ]
 
 

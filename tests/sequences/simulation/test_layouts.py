@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from sequences import se3
-from sequences.simulation import PlaceConfig
-from sequences.simulation.layouts import KINDS, ROBOT_M, choose_furniture
+from sequences.errors import InputError
+from sequences.simulation import PlaceConfig, layouts
+from sequences.simulation.layouts import KINDS, ROBOT_M, choose_furniture, lay_out
 from sequences.simulation.place import Place, furnish
 from sequences.simulation.shapes import household
 from sequences.simulation.standing import separation
@@ -60,3 +61,9 @@ def test_a_room_has_what_its_kind_always_has_and_perhaps_more():
 
 def test_all_kinds_of_room_are_drawn():
     assert {furnish(PlaceConfig(objects=1, twins=0, clutter=0), seed).kind for seed in range(30)} == set(KINDS)
+
+
+def test_furniture_that_fits_in_no_room_is_refused(monkeypatch):
+    monkeypatch.setattr(layouts, "TRIES", 50)
+    with pytest.raises(InputError, match="no room"):
+        lay_out([np.array([4.0, 2.0, 1.0])] * 3, np.random.default_rng(0))
