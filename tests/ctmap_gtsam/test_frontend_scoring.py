@@ -138,7 +138,7 @@ def test_registration_comes_back_from_two_centimetres_and_ten_degrees(name):
     r = residual(refined, T, shape.symmetry)
     reduced = np.linalg.norm(r[:, :3], axis=-1), np.linalg.norm(r[:, 3:], axis=-1)
     back = (reduced[0] < 0.02) & (reduced[1] < 0.001)
-    assert back.mean() >= 0.75
+    assert back.mean() > 0.75
 
 
 def test_the_truth_stays_where_it_is():
