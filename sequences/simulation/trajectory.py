@@ -120,7 +120,7 @@ def _stop(place: Place, piece: Placed, eye: Array, config: TrajectoryConfig, rng
     side, upside = rng.choice([-1.0, 1.0], 2)
     looks = []
     for end in (-side, side):
-        height = (low + high) / 2.0 + end * upside * rng.uniform(0.1, 0.5) * (high - low)
+        height = (low + high) / 2.0 + end * upside * rng.uniform(0.1, 0.35) * (high - low)
         target = centre + end * SWEEP * width * T[:3, 0] + [0.0, 0.0, height]
         turn = rng.uniform(0.0, 2.0 * np.pi)
         eye = _stand(place, T, target, eye + DRIVE_M * np.array([np.cos(turn), np.sin(turn)]), config, rng)
