@@ -61,4 +61,5 @@ def test_the_command_writes_the_figures(tmp_path):
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "d.json").read_text())
     assert result["name"] == "detector"
-    assert 0.2 < result["figures"]["detector.map_50_at_1"] < 1.0
+    noise = Config().simulation.detector.noise
+    assert 0.2 < result["figures"][f"detector.map_50_at_{noise:.3g}"] < 1.0
