@@ -21,7 +21,7 @@ from sequences import se3
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.rendering.rasteriser import intrinsics
-from sequences.rendering.scene import SceneImages, render_scene
+from sequences.rendering.scene import render_scene
 
 Array = NDArray[np.float64]
 
@@ -93,12 +93,6 @@ class LitScene:
     """meshes with T_world_object (4, 4)"""
     surface: Surface
     lights: Lights
-
-    def face_normals(self, images: SceneImages) -> Array:
-        """(h, w, 3) normal of the face that each pixel sees, outwards, world frame; zero where nothing is."""
-        face = self.surface.offsets[np.maximum(images.item, 0)] + np.maximum(images.face, 0)
-        normals = _unit(_area_vectors(self.surface.vertices[self.surface.faces]))
-        return np.where(images.item[..., None] >= 0, normals[face], 0.0)
 
 
 def light(

@@ -8,7 +8,6 @@ Planes, which need no truth, compare the noise further away, with a Kinect too (
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -207,10 +206,3 @@ def _ratio(simulated: float | None, real: float | None) -> float | None:
 
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def easier(results: dict[str, Any], tolerance: float = 0.05) -> Iterator[str]:
-    """The figures in which simulated depth is easier than the recording that it is held to."""
-    for name, value in results.items():
-        if ".over_real." in name and value is not None and value < 1.0 - tolerance:
-            yield name
