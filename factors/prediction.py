@@ -27,6 +27,8 @@ from sequences import se3
 
 Array = NDArray[np.float64]
 
+_STEEPEST = 100.0  # of a derivative of the residual, by rad and metres
+
 
 def covariance(
     rotation_rad2_per_s: float, translation_m2_per_s: float, dt_s: ArrayLike, symmetry: Symmetry = NONE
@@ -104,6 +106,8 @@ def integrated_log_potential(
     # turning an object about its free axis only turns the residual with it, which no isotropic Sigma notices
     meant = np.eye(6) - symmetry.generators @ symmetry.reader
     for J, spread in ((J_a @ meant, covariance_a), (J_b @ meant, covariance_b)):
+        # where free axes are opposite every turn is as near as any, and the derivative has no bound and no meaning
+        J = np.clip(J, -_STEEPEST, _STEEPEST)
         total = total + J @ np.asarray(spread, dtype=np.float64) @ np.swapaxes(J, -1, -2)
     return mixture.gaussian_log_density(r, np.linalg.inv(total))
 

@@ -110,6 +110,20 @@ def test_what_a_free_axis_does_not_know_costs_nothing(name):
     assert prediction.integrated_log_potential(T_a, unknown, T_b, unknown, sigma, symmetry) == pytest.approx(value)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9, 1e-6])
+def test_opposite_free_axes_are_far_apart_and_no_more(off):
+    """Every turn about the axis is as near as any other there: the derivative has no bound, the potential has."""
+    symmetry = SYMMETRIES["axis"]
+    across = np.linalg.svd(symmetry.axes[:1])[2][1]
+    T_a = random_pose(np.random.default_rng(3))
+    T_b = T_a @ se3.exp(np.concatenate([(np.pi - off) * across, np.zeros(3)]))
+    sigma = prediction.covariance(1e-3, 1e-4, 1.0, symmetry)
+    spread = 1e-4 * np.eye(6)
+    value = prediction.integrated_log_potential(T_a, spread, T_b, spread, sigma, symmetry)
+    assert np.isfinite(value)
+    assert value < prediction.integrated_log_potential(T_a, spread, T_a, spread, sigma, symmetry) - 10.0
+
+
 def test_batches_broadcast():
     rng = np.random.default_rng(0)
     T_a, T_b = random_pose(rng), np.stack([random_pose(rng) for _ in range(5)])
