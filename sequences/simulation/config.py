@@ -118,7 +118,7 @@ class LocalisationConfig:
 class DetectorConfig:
     """The detector."""
 
-    noise: float = option(1.05, "scales every imperfection; 0 is a perfect detector", low=0.0, high=4.0)
+    noise: float = option(1.03, "scales every imperfection; 0 is a perfect detector", low=0.0, high=4.0)
     furniture: bool = option(True, "whether tables and shelves are detected too")
     confusions: tuple[tuple[str, str], ...] = option(
         (("loofah", "bowl"), ("milk_carton", "shampoo_bottle")),
