@@ -13,7 +13,7 @@ from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate, Ledger, Modes, Moves
 from ctmap_gtsam.runtime import settings
 from ctmap_gtsam.runtime.versions import versions
-from sequences.types import Run
+from sequences.types import LocalisationNoise, Run
 
 Array = NDArray[np.float64]
 
@@ -100,6 +100,11 @@ def build_estimate(
         ledger=Ledger(*_columns(tables.ledger, (np.int64,) * 4 + (np.float64,), ((),) * 5)),
         meta=meta,
     )
+
+
+def localisation_covariance(noise: LocalisationNoise) -> Array:
+    """(6, 6) of the recorded camera pose's right tangent."""
+    return np.diag(np.repeat([noise.rotation_rad, noise.translation_m], 3) ** 2)
 
 
 _MOVE_TYPES = (np.int64, np.int64, np.float64, np.int64, np.int64, np.int64)

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.baselines.placing import Placement, estimate_of, seen_as
+from ctmap_gtsam.building import localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.filter import localisation_covariance
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.building import Tables, build_estimate
+from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.filter import localisation_covariance
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.shapes import Shape
 from sequences.types import Frame, Run

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.building import Tables, build_estimate
+from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
@@ -27,7 +27,7 @@ from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
 from sequences.progress import SILENT, Progress
-from sequences.types import Detection, Frame, LocalisationNoise, Run
+from sequences.types import Detection, Frame, Run
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ class _State:
             around = surroundings.without(i)
             self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
             reported[i] = self.updater.report(self.beliefs[i], around)
-        reported |= self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
+        reported = self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
         for i, r in reported.items():
             self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
         self.reports.append(self._find_moved(reported))
@@ -115,7 +115,7 @@ class _State:
         reported: Mapping[int, Reported],
         before: Mapping[int, Reported],
     ) -> dict[int, Reported]:
-        """Beliefs of tracks that have just become consistent, but for those of objects that are known.
+        """`reported` with the objects of tracks that have just become consistent, where they aren't known already.
 
         They know no neighbours among themselves yet, so all start a second time beside those that were sure of
         themselves.
@@ -130,14 +130,14 @@ class _State:
                 i = track.track_id
                 started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
             fresh = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
-        changed: dict[int, Reported] = {}
+        there = dict(reported)
         for i, report in fresh.items():
-            known = at_place(report, {**reported, **changed}, self.model)
-            self.owner[i] = i if known is None else known
-            if known is None or {**reported, **changed}[known].existence < min(0.5, report.existence):
-                self.beliefs[self.owner[i]] = replace(started[i], object_id=self.owner[i])
-                changed[self.owner[i]] = report
-        return changed
+            known = at_place(report, there, self.model)
+            owner = self.owner[i] = i if known is None else known
+            if known is None or there[known].existence < min(0.5, report.existence):
+                self.beliefs[owner] = replace(started[i], object_id=owner)
+                there[owner] = report
+        return there
 
     def _find_moved(self, reported: dict[int, Reported]) -> dict[int, Reported]:
         """Objects whose place was found empty and that are met elsewhere go on there."""
@@ -208,8 +208,3 @@ def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame
 def _within(found: Sequence[tuple[int, tuple[int, int], float]], i: int, begin: int, end: int) -> bool:
     """Whether an object was found to have moved in a time that overlaps with another."""
     return any(j == i and between[0] < end and begin < between[1] for j, between, _ in found)
-
-
-def localisation_covariance(noise: LocalisationNoise) -> Array:
-    """(6, 6) of the recorded camera pose's right tangent."""
-    return np.diag(np.repeat([noise.rotation_rad, noise.translation_m], 3) ** 2)

@@ -160,13 +160,15 @@ class Proposer:
             rng: draws the poses.
             share: of the configured effort.
         """
+        assert view.detection is not None
+        box = np.array(view.detection.box)
         view = view.coarse()
-        share *= self._worth(shape, view, observation)
-        drawn = self._draw(
-            shape, view, observation, surroundings, rng, max(8, round(share * self.settings.fresh_poses))
-        )
-        if drawn is None:
+        z = centre_depth(observation.depth, box)
+        if z == 0.0:
             return np.zeros((0, 4, 4))
+        share *= _worth(shape, float(np.hypot(*box[2:])) * z / observation.frame.camera.fx)
+        n = max(8, round(share * self.settings.fresh_poses))
+        drawn = self._draw(shape, box, z, observation, surroundings, rng.random((n, 6 + UNIFORMS)))
         keep = max(2, round(share * self.settings.refined_poses))
         coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
@@ -216,39 +218,27 @@ class Proposer:
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
 
-    def _worth(self, shape: Shape, view: View, observation: Observation) -> float:
-        """Effort for a class by its size: more for furniture, little for what could hardly look so large or so small.
-
-        Something much smaller than its class would be seen may be hidden but for a part, so it is searched for, too.
-        """
-        assert view.detection is not None
-        box = np.array(view.detection.box)
-        z = centre_depth(observation.depth, box)
-        if z == 0.0:
-            return 1.0
-        seen_m = float(np.hypot(*box[2:])) * z / observation.frame.camera.fx
-        sides = np.sort(np.ptp(shape.mesh.vertices, axis=0))
-        if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
-            return _LITTLE
-        return _FURNITURE if shape.reach_m > _SMALL_REACH_M else 1.0
-
     def _draw(
         self,
         shape: Shape,
-        view: View,
+        box: Array,
+        z: float,
         observation: Observation,
         surroundings: Surroundings,
-        rng: np.random.Generator,
-        n: int,
-    ) -> Array | None:
-        """First poses (n, 4, 4): the paper's, and where there are level surfaces, half of them at rest on one."""
-        assert view.detection is not None
-        camera, box = observation.frame.camera, np.array(view.detection.box)
-        z = centre_depth(observation.depth, box)
-        if z == 0.0:
-            return None
-        uniforms = rng.random((n, 6 + UNIFORMS))
-        low, high = _centre_region(box, view.image_size, shape.reach_m / z)
+        uniforms: Array,
+    ) -> Array:
+        """First poses (n, 4, 4): the paper's, and where there are level surfaces, half of them at rest on one.
+
+        Args:
+            shape: the class.
+            box: (4,) detected, x, y, w, h.
+            z: depth in its middle, metres.
+            observation: the keyframe.
+            surroundings: with the level surfaces.
+            uniforms: (n, 6 + UNIFORMS) random numbers in [0, 1).
+        """
+        camera, n = observation.frame.camera, len(uniforms)
+        low, high = _centre_region(box, (camera.width, camera.height), shape.reach_m / z)
         pixels = low + uniforms[:, :2] * (high - low)
         rays = camera.backproject(pixels[:, 0], pixels[:, 1], np.ones(n))
         # the centre lies behind the surface that is seen, by anything up to its extent
@@ -348,6 +338,21 @@ class Proposer:
         scaled = hessian * unit[:, None] * unit * self.model.kappa / sensor.sigma_m**2
         scaled = scaled + np.eye(6) / _LADDER_M[-1] ** 2
         return np.linalg.inv(scaled) * unit[:, None] * unit
+
+
+def _worth(shape: Shape, seen_m: float) -> float:
+    """Effort for a class by its size: more for furniture, little for what could hardly look so large or so small.
+
+    Something much smaller than its class would be seen may be hidden but for a part, so it is searched for, too.
+
+    Args:
+        shape: the class.
+        seen_m: the box's diagonal at the depth of its middle, metres.
+    """
+    sides = np.sort(np.ptp(shape.mesh.vertices, axis=0))
+    if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
+        return _LITTLE
+    return _FURNITURE if shape.reach_m > _SMALL_REACH_M else 1.0
 
 
 def _ladder(poses: Array, axes: Array) -> Array:
