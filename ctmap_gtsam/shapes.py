@@ -25,6 +25,8 @@ from sequences.meshes import simplify
 Array = NDArray[np.float64]
 
 _ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
+_ONE_FLAT_M = 0.01  # triangles of one flat lie so near to one plane ...
+_FLAT_SHARE = 0.02  # ... and make up this share of the surface together
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,31 @@ class Shape:
         return self._stable[1]
 
     @cached_property
+    def _areas(self) -> Array:
+        """(F,) of the mesh's faces, square metres."""
+        a, b, c = (self.mesh.vertices[self.mesh.faces[:, i]] for i in range(3))
+        return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1))
+
+    @cached_property
     def main_normal(self) -> Array:
         """(3,) normal of the direction that most of the surface faces, this way or the other, centre frame."""
-        a, b, c = (self.mesh.vertices[self.mesh.faces[:, i]] for i in range(3))
-        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
         facing = np.abs(self.normals @ self.normals.T) > _ONE_FACE
-        return self.normals[int(np.argmax(facing @ area))]
+        return self.normals[int(np.argmax(facing @ self._areas))]
+
+    @cached_property
+    def flats(self) -> Array:
+        """(n, 4) the flat parts of the surface, largest first: outward unit normal n and offset, n . p = offset."""
+        offsets = (self.normals * self._middles).sum(axis=-1)
+        left, total, found = self._areas.copy(), self._areas.sum(), []
+        while left.any():
+            # the largest triangle's plane, with all that lies in it
+            k = int(np.argmax(left))
+            one = (self.normals @ self.normals[k] > _ONE_FACE) & (np.abs(offsets - offsets[k]) < _ONE_FLAT_M)
+            area = float(left[one].sum())
+            if area >= _FLAT_SHARE * total:
+                found.append((area, *self.normals[k], float(np.average(offsets[one], weights=left[one] + 1e-12))))
+            left[one] = 0.0
+        return np.array(sorted(found, reverse=True)).reshape(-1, 5)[:, 1:]
 
     @cached_property
     def distance(self) -> DistanceField:
@@ -88,8 +109,12 @@ class Shape:
 
     def surface_points(self, n: int) -> Array:
         """(<= n, 3) middles of faces spread over the surface, centre frame."""
-        middles = self.mesh.vertices[self.mesh.faces].mean(axis=1)
-        return np.asarray(middles[:: max(1, -(-len(middles) // n))])
+        return np.ascontiguousarray(self._middles[:: max(1, -(-len(self._middles) // n))])
+
+    @cached_property
+    def _middles(self) -> Array:
+        """(F, 3) of the mesh's faces, centre frame."""
+        return np.asarray(self.mesh.vertices[self.mesh.faces].mean(axis=1))
 
     def to_object(self, T_frame_centre: Array) -> Array:
         """Poses (..., 4, 4) of the centre frame -> of the mesh frame."""

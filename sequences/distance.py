@@ -39,6 +39,14 @@ class DistanceField:
             map_coordinates(self.values, np.moveaxis(grid, -1, 0), order=1, mode="nearest", output=np.float64)
         )
 
+    def deepest(self, T_mesh_points: Array, points: Array) -> Array:
+        """How deep the deepest of points (P, 3) lies inside at poses (K, 4, 4): (K,) metres, 0 where all are outside.
+
+        What `at` says of all of them, without the K x P points in memory.
+        """
+        poses = np.ascontiguousarray(T_mesh_points, dtype=np.float64)
+        return np.asarray(_deepest(poses, points, self.origin, 1.0 / self.spacing_m, self.values))
+
 
 def distance_field(mesh: Mesh, nodes: int = 32) -> DistanceField:
     """Compute the field of a mesh with so many nodes along its longest side, a margin of two around it."""
@@ -67,6 +75,31 @@ def _spread(mesh: Mesh) -> Array:
         w = np.stack([1.0 - u - v, u, v])
         parts.append(np.einsum("kp,kfd->fpd", w, np.stack([a[rows], b[rows], c[rows]])).reshape(-1, 3))
     return np.concatenate(parts)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _deepest(poses, points, origin, inverse_spacing, values):
+    out = np.zeros(poses.shape[0])
+    last_x, last_y, last_z = values.shape[0] - 1.0, values.shape[1] - 1.0, values.shape[2] - 1.0
+    for k in range(poses.shape[0]):
+        T, lowest = poses[k], 0.0
+        for p in range(points.shape[0]):
+            a, b, c = points[p, 0], points[p, 1], points[p, 2]
+            x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3] - origin[0]) * inverse_spacing
+            y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3] - origin[1]) * inverse_spacing
+            z = (T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - origin[2]) * inverse_spacing
+            # the grid's border lies outside of the mesh
+            if not (0.0 <= x < last_x and 0.0 <= y < last_y and 0.0 <= z < last_z):
+                continue
+            i, j, m = int(x), int(y), int(z)
+            u, v, w = x - i, y - j, z - m
+            near = (1.0 - v) * ((1.0 - w) * values[i, j, m] + w * values[i, j, m + 1])
+            near += v * ((1.0 - w) * values[i, j + 1, m] + w * values[i, j + 1, m + 1])
+            far = (1.0 - v) * ((1.0 - w) * values[i + 1, j, m] + w * values[i + 1, j, m + 1])
+            far += v * ((1.0 - w) * values[i + 1, j + 1, m] + w * values[i + 1, j + 1, m + 1])
+            lowest = min(lowest, (1.0 - u) * near + u * far)
+        out[k] = -lowest
+    return out
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")

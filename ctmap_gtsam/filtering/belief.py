@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.building import Tables
+from ctmap_gtsam.filtering.memory import Memory
 from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.observation import Observation
@@ -27,8 +28,10 @@ Array = NDArray[np.float64]
 
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
-_DORMANT = 45.0  # nats behind the best class beyond which a class is weighed now and then
-_WAKE_EVERY = 15  # keyframes in view
+_DORMANT = (45.0, 0.25)  # nats behind the best class, and share of its evidence, beyond which a class sleeps
+_WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighed and searched for
+_BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
+_LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
 _IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
 _MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
 _REPORTED = 0.01  # classes less probable than this are not reported with poses
@@ -70,6 +73,9 @@ class Belief:
     visible: bool
     steps: int
     """keyframes in view since the start"""
+    searched: int = 1
+    """steps when it was last searched for"""
+    memory: Memory = field(default_factory=Memory)
 
     def class_log_evidence(self, model: Model) -> Array:
         """(C,) log evidence of each class at this place, prior included."""
@@ -84,8 +90,18 @@ class _Effort:
     particles: int
     likely: bool
     """near enough to the best class to be looked at closely"""
-    search: bool
-    """afresh, beside what is believed"""
+    standard: _Standard | None
+    """where it is searched for afresh, beside what is believed: what new poses are held to"""
+
+
+@dataclass(frozen=True)
+class _Standard:
+    """What the most probable class says of the views so far: what poses found late are held to."""
+
+    log_evidence: float
+    """depth and boxes"""
+    remembered: float
+    """log-likelihood of the views that are kept"""
 
 
 @dataclass(frozen=True)
@@ -185,7 +201,8 @@ class Updater:
             visible=True,
             steps=1,
         )
-        fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation))
+        memory = Memory().joined(view, observation.frame.T_camera_world)
+        fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation), memory=memory)
         return replace(fresh, log_clutter=self._clutter(fresh, view, observation))
 
     def _first_view(self, track: Track, observation: Observation, around: Surroundings) -> View:
@@ -206,9 +223,8 @@ class Updater:
         waited = (observation.frame.time_ns - belief.time_ns) * 1e-9
         share = self.model.view_share(belief.viewpoint, viewpoint, waited)
         view = self.proposer.view(observation, box, detection, around, share)
-        likely = belief.class_log_evidence(self.model)
-        counts = self._counts(likely)
-        classes = self._step_classes(belief, view, observation, around, counts, likely - likely.max())
+        search = view.detection is not None and belief.steps - belief.searched >= self.model.config.filter.search_every
+        classes = self._step_classes(belief, view, observation, around, search)
         scores = belief.score_sum if detection is None else belief.score_sum + self.model.class_scores(detection)
         moved = replace(
             belief,
@@ -219,6 +235,8 @@ class Updater:
             viewpoint=viewpoint,
             visible=True,
             steps=belief.steps + 1,
+            searched=belief.steps if search else belief.searched,
+            memory=belief.memory.joined(view, observation.frame.T_camera_world),
         )
         return replace(moved, log_clutter=belief.log_clutter + self._clutter(moved, view, observation))
 
@@ -311,29 +329,42 @@ class Updater:
         return np.maximum(np.round(settings.particles * share), settings.min_particles).astype(np.int64)
 
     def _step_classes(
-        self,
-        belief: Belief,
-        view: View,
-        observation: Observation,
-        around: Surroundings,
-        counts: NDArray[np.int64],
-        behind: Array,
+        self, belief: Belief, view: View, observation: Observation, around: Surroundings, search: bool
     ) -> tuple[ClassBelief | None, ...]:
-        """Every class; those far behind the best (C,) only now and then: in between they keep their distance to it."""
-        possible = behind > -_DORMANT
-        awake = possible | (belief.steps % _WAKE_EVERY == 0)
-        search = view.detection is not None and belief.steps % self.model.config.filter.search_every == 0
+        """Every class; those far behind the best only now and then: in between they keep their distance to it."""
+        evidence = belief.class_log_evidence(self.model)
+        counts, best = self._counts(evidence), int(np.argmax(evidence))
+        behind = evidence - evidence[best]
+        depth = belief.classes[best]
+        least, share = _DORMANT
+        bound = max(least, share * (0.0 if depth is None else depth.log_evidence))
+        # what wakes is searched for: it may be behind because nobody found it
+        awake = (behind > -bound) | (search and belief.steps // _WAKE_EVERY > belief.searched // _WAKE_EVERY)
+        standard = self._standard(belief, best) if search else None
         stepped = {}
         for c in np.flatnonzero(awake):
-            effort = _Effort(int(counts[c]), likely=bool(behind[c] > -_LIKELY), search=search and bool(possible[c]))
+            effort = _Effort(int(counts[c]), likely=bool(behind[c] > -_LIKELY), standard=standard)
             stepped[int(c)] = self._step_class(belief, self.model.shapes[c], view, observation, around, effort)
-        best = int(np.argmax(behind))
-        before, after = belief.classes[best], stepped[best]
-        gained = after.log_evidence - before.log_evidence if before is not None and after is not None else 0.0
+        after = stepped[best]
+        gained = after.log_evidence - depth.log_evidence if depth is not None and after is not None else 0.0
         asleep = (
             None if own is None else replace(own, log_evidence=own.log_evidence + gained) for own in belief.classes
         )
         return tuple(stepped[c] if awake[c] else own for c, own in enumerate(asleep))
+
+    def _standard(self, belief: Belief, best: int) -> _Standard | None:
+        own = belief.classes[best]
+        if own is None:
+            return None
+        return _Standard(own.log_evidence, self._remembered(belief, self.model.shapes[best], own.particles.best(1)[0]))
+
+    def _remembered(self, belief: Belief, shape: Shape, T_world_centre: Array) -> float:
+        away = float(np.linalg.norm(belief.viewpoint))
+        noise = self.localisation
+        reach = np.array([noise.rotation_rad, noise.translation_m + away * noise.rotation_rad])
+        prediction = self.model.config.prediction
+        walked = np.array([prediction.rotation_rate, prediction.translation_rate])
+        return belief.memory.log_likelihood(self.proposer, shape, T_world_centre, _LOCALISED * (reach + walked))
 
     def _step_class(
         self,
@@ -351,12 +382,48 @@ class Updater:
         starts = np.zeros((0, 4, 4))
         if own is not None:
             starts = observation.frame.T_camera_world @ own.particles.best(3)
-        if effort.search:
+        if effort.standard is not None:
             found = self.proposer.search(shape, view, observation, around, rng, self.model.config.filter.search_share)
             starts = np.concatenate([starts, found])
-        proposals = self._in_world(self.proposer.modes(shape, view, starts, probe=effort.likely), observation)
+        modes = self.proposer.modes(shape, view, starts, probe=effort.likely)
+        proposals = self._in_world(modes, observation)
+        if effort.standard is not None and proposals is not None:
+            own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
         spread = self._spread(observation, belief.time_ns, starts)
         return self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)
+
+    def _reconsider(
+        self,
+        belief: Belief,
+        shape: Shape,
+        own: ClassBelief | None,
+        found: Gaussians,
+        standard: _Standard,
+        rng: np.random.Generator,
+    ) -> ClassBelief | None:
+        """What is believed of a class, or what should have been if the views kept are better explained by a new pose.
+
+        Args:
+            belief: of the object.
+            shape: the class.
+            own: what was believed of the class.
+            found: modes of this view, the best first.
+            standard: what the most probable class says of the views that are kept.
+            rng: draws particles around the new pose.
+        """
+        T = found.T_world_centre[0]
+        if own is not None and _same_pose(own.particles.best(1)[0], T, shape):
+            return own
+        mode = Gaussians(found.T_world_centre[:1], found.covariance[:1], np.zeros(1))
+        remembered = self._remembered(belief, shape, T)
+        # the views that are kept stand for all roughly, in which both err alike; unless the standard itself has moved
+        beside = standard.log_evidence + remembered - standard.remembered
+        alone = remembered + self.model.log_uniform(shape) - float(mode.log_density(T[None], shape)[0])
+        late = min(beside, alone)
+        if own is not None and late < own.log_evidence + _BETTER:
+            return own
+        n = self.model.config.filter.min_particles
+        return ClassBelief(Particles(mode.draw(n, shape, rng), np.full(n, -np.log(n))), late)
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
@@ -402,9 +469,10 @@ class Updater:
         score, scores = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
         log_prior = log_drawn = np.full(len(T), log_uniform)
         if own is not None and spread is not None:
-            jump = self.model.config.prediction.jump_probability
+            # nobody pushes a cupboard; if it seems to be elsewhere it was never found, which a search can mend
+            jump = self.model.config.prediction.jump_probability if shape.source.movable else 0.0
             stayed = np.log1p(-jump) + predicted_log_density(own.particles, T, spread, shape)
-            log_drawn = np.logaddexp(stayed, np.log(jump) + log_uniform)
+            log_drawn = np.logaddexp(stayed, np.log(jump) + log_uniform) if jump > 0.0 else stayed
             # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
             seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
             log_prior = np.where(seen, log_drawn, stayed)
@@ -439,6 +507,12 @@ class Updater:
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
+
+
+def _same_pose(a: Array, b: Array, shape: Shape) -> bool:
+    """Whether two poses (4, 4) are one mode."""
+    r = symmetry.residual(a[None], b, shape.symmetry)[0]
+    return bool(np.linalg.norm(r[:3]) < _MODE_RADIUS[0] and np.linalg.norm(r[3:]) < _MODE_RADIUS[1])
 
 
 def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth
-from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses
+from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses, shifted_poses, snapped_poses
 from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine_on_depth, score_depth
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
@@ -38,7 +38,7 @@ _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
 _CLIMBS, _CLIMB_NATS = 6, 0.05  # at most so many moves on the score, each gaining at least this much
 _SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
 _UNLIKE = 0.4  # sizes of which one is less than this share of the other don't belong together
-_LITTLE, _FURNITURE = 0.25, 2.0  # effort for a class of the wrong size, and for one that is large
+_LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
@@ -168,13 +168,15 @@ class Proposer:
             return np.zeros((0, 4, 4))
         share *= _worth(shape, float(np.hypot(*box[2:])) * z / observation.frame.camera.fx)
         n = max(8, round(share * self.settings.fresh_poses))
-        drawn = self._draw(shape, box, z, observation, surroundings, rng.random((n, 6 + UNIFORMS)))
+        drawn = self._draw(shape, box, z, observation, surroundings, rng.random((n, 6 + UNIFORMS)), rng)
         keep = max(2, round(share * self.settings.refined_poses))
         coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
-        around = self._refine(
-            shape, view, self._perturb(shape, best, rng), self._coarse(shape)[self._coarse_steps // 2 :]
-        )
+        starts = self._perturb(shape, best, rng)
+        if shape.reach_m > _SMALL_REACH_M:
+            shifted = shifted_poses(shape, best, observation.planes)
+            starts = np.concatenate([starts, self._best(shape, view, shifted, keep)])
+        around = self._refine(shape, view, starts, self._coarse(shape)[self._coarse_steps // 2 :])
         return np.concatenate([coarse, around])
 
     def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True) -> PoseModes:
@@ -200,6 +202,21 @@ class Proposer:
         covariance = self._shape_of_score(shape, view, poses, probe)
         return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance)
 
+    def near(self, shape: Shape, view: View, T_camera_centre: Array, reach: Array) -> float:
+        """The best log-likelihood of a view about one pose (4, 4): there, or where depth draws it, if that is in reach.
+
+        Args:
+            shape: the class.
+            view: where to look.
+            T_camera_centre: the pose.
+            reach: (2,) rad and metres by which it may be moved.
+        """
+        drawn = self._refine(shape, view, T_camera_centre[None], self._fine)
+        xi = se3.local(T_camera_centre, drawn[0])
+        within = np.linalg.norm(xi[:3]) <= reach[0] and np.linalg.norm(xi[3:]) <= reach[1]
+        poses = np.concatenate([T_camera_centre[None], drawn]) if within else T_camera_centre[None]
+        return float(self.score(shape, view, poses)[0].max())
+
     def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
 
@@ -207,13 +224,13 @@ class Proposer:
         the depth already; its boxes come less often, and fit as well.
         """
         detector = self.model.config.detector
-        if view.detection is None:
-            return view.share * float(np.log1p(-detector.clutter_rate))
         rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
         z, background, sensor = view.tile.depth, view.tile.background, self.model.config.sensor
-        seen = (rendered > 0) & (z > rendered - sensor.occlusion_margin_m)
+        there = (rendered > 0) & (z > 0) & (np.abs(z - rendered) < shape.radius_m)
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
+        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((there & surprising).sum())
+        if view.detection is None:
+            return view.share * (gain + float(np.log1p(-detector.clutter_rate)))
         box = np.array(view.detection.box)
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
@@ -226,8 +243,11 @@ class Proposer:
         observation: Observation,
         surroundings: Surroundings,
         uniforms: Array,
+        rng: np.random.Generator,
     ) -> Array:
         """First poses (n, 4, 4): the paper's, and where there are level surfaces, half of them at rest on one.
+
+        Half of furniture's are drawn to the planes that are seen (see `resting`).
 
         Args:
             shape: the class.
@@ -236,6 +256,7 @@ class Proposer:
             observation: the keyframe.
             surroundings: with the level surfaces.
             uniforms: (n, 6 + UNIFORMS) random numbers in [0, 1).
+            rng: draws what planes are.
         """
         camera, n = observation.frame.camera, len(uniforms)
         low, high = _centre_region(box, (camera.width, camera.height), shape.reach_m / z)
@@ -250,8 +271,13 @@ class Proposer:
         up = surfaces[0].normal
         resting = resting_poses(shape, rays, surfaces, observation.planes, up, uniforms[:, 6:])
         near = np.abs(resting[:, 2, 3] - z) < _REST_REACH * shape.reach_m
-        resting = resting[near][: n // 2]
-        return np.concatenate([resting, anyhow[: n - len(resting)]])
+        if shape.reach_m <= _SMALL_REACH_M or not len(shape.flats):
+            resting = resting[near][: n // 2]
+            return np.concatenate([resting, anyhow[: n - len(resting)]])
+        resting = resting[near][: n // 4]
+        half = slice(n - n // 2, n)
+        snapped = snapped_poses(shape, anyhow[half, :3, 3], observation.planes, up, uniforms[half, 6:], rng)
+        return np.concatenate([resting, anyhow[: n - len(resting) - len(snapped)], snapped])
 
     def _best(self, shape: Shape, view: View, poses: Array, n: int) -> Array:
         score, _ = self.score(shape, view, poses)

@@ -1,8 +1,11 @@
-"""Poses of things that rest on a level surface: three unknowns instead of six.
+"""Poses of things that rest on a level surface, or whose flat parts are the planes that are seen.
 
 Most things stand on something. Where surfaces are known, a pose is a stable rest of the mesh, a yaw, and a place on
-the surface, which the pixel of its centre tells. Furniture and boxes mostly stand along walls and other upright planes,
-so half of the yaws turn a face of the thing to such a plane.
+the surface, which the pixel of its centre tells: three unknowns instead of six. Furniture and boxes mostly stand along
+walls and other upright planes, so half of the yaws turn a face of the thing to such a plane.
+
+Of furniture the camera rarely sees the whole, nor the floor, but planes: a top, a board, a side. Each of them is one of
+the few flat parts of the mesh, or the wall behind it, and settles one unknown of the place.
 """
 
 from __future__ import annotations
@@ -17,8 +20,11 @@ from sequences.geometry import Plane
 Array = NDArray[np.float64]
 
 _UPRIGHT = 0.2  # cosine to the vertical below which a plane counts as upright
+_SNAPPED = 0.75  # of the planes that a flat part could be, those that it is taken to be
+_ALIGNED = 0.8  # of the yaws that are turned to an upright plane, where poses are drawn to planes
+_ONE_DIRECTION = 0.985  # cosine between the normals of a plane and the flat part that it may be
 UNIFORMS = 3
-"""random numbers in [0, 1) that `resting_poses` takes a pose"""
+"""random numbers in [0, 1) that `resting_poses` and `snapped_poses` take a pose"""
 
 
 def resting_poses(
@@ -50,6 +56,58 @@ def resting_poses(
         z = (offset + height) / np.einsum("nk,nk->n", normal, rays)
     before = np.isfinite(z) & (z > 0.0)
     return se3.make(R[before], (z[:, None] * rays)[before])
+
+
+def snapped_poses(
+    shape: Shape, centres: Array, planes: tuple[Plane, ...], up: Array, uniforms: Array, rng: np.random.Generator
+) -> Array:
+    """Poses (n, 4, 4) T_camera_centre of a shape in a stable rest, moved so that flat parts of it lie in planes.
+
+    Args:
+        shape: the class.
+        centres: (n, 3) about where its centre is, camera frame.
+        planes: all planes that the image shows, camera frame.
+        up: (3,) unit, against gravity, camera frame.
+        uniforms: (n, `UNIFORMS`) which rest, which yaw.
+        rng: draws which flat part is which plane.
+    """
+    chosen = np.searchsorted(np.cumsum(shape.rest_weights), uniforms[:, 0] * (1.0 - 1e-12))
+    R_level_centre = shape.rests[chosen]
+    R_camera_level = _level_frame(up)
+    turned = np.where(uniforms[:, 2] < _ALIGNED, 0.5 + 0.5 * uniforms[:, 1], 0.5 * uniforms[:, 1])
+    R = R_camera_level @ _turns(_yaws(R_camera_level, R_level_centre, shape, planes, turned)) @ R_level_centre
+    t = centres.copy()
+    for plane in planes:
+        away, possible = _away(shape, R, t, plane)
+        pick = np.argmax(rng.random(possible.shape) * possible, axis=1)
+        apt = possible.any(axis=1) & (rng.random(len(t)) < _SNAPPED)
+        t += np.where(apt, away[np.arange(len(t)), pick], 0.0)[:, None] * plane.normal
+    return se3.make(R, t)
+
+
+def shifted_poses(shape: Shape, poses: Array, planes: tuple[Plane, ...]) -> Array:
+    """Poses (m, 4, 4) beside poses (n, 4, 4) T_camera_centre, one of the planes each being another flat part.
+
+    A shelf whose boards are mistaken for those above them explains most of what is seen.
+    """
+    out = [np.zeros((0, 4, 4))]
+    for plane in planes:
+        away, possible = _away(shape, poses[:, :3, :3], poses[:, :3, 3], plane)
+        rows, flats = np.nonzero(possible)
+        moved = poses[rows].copy()
+        moved[:, :3, 3] += away[rows, flats, None] * plane.normal
+        out.append(moved)
+    return np.concatenate(out)
+
+
+def _away(shape: Shape, R: Array, t: Array, plane: Plane) -> tuple[Array, NDArray[np.bool_]]:
+    """How far (n, F) flat parts lie before a plane, metres, and whether they may be that plane.
+
+    That may be any flat part that faces as the plane does and isn't further off than the thing is large.
+    """
+    facing = np.einsum("nij,fj,i->nf", R, shape.flats[:, :3], plane.normal) > _ONE_DIRECTION
+    away = (plane.offset - t @ plane.normal)[:, None] - shape.flats[:, 3]
+    return away, facing & (np.abs(away) < shape.reach_m)
 
 
 def _level_frame(up: Array) -> Array:

@@ -47,12 +47,8 @@ class Neighbour:
         # two of one form in one pose touch everywhere and reach into each other nowhere
         if apart < 0.5 * min(self.shape.radius_m, other.shape.radius_m):
             return True
-        return any(
-            penetration_depth(a.shape, se3.transform(se3.inverse(a.T_world_centre) @ b.T_world_centre, points))[()]
-            > _CONTENTION_M
-            for a, b in ((self, other), (other, self))
-            for points in (b.shape.surface_points(_CONTACTS)[None],)
-        )
+        T_own_other = (se3.inverse(self.T_world_centre) @ other.T_world_centre)[None]
+        return bool(penetration_depth(self.shape, other.shape, T_own_other)[0] > _CONTENTION_M)
 
 
 @dataclass(frozen=True)
@@ -105,19 +101,19 @@ class Surroundings:
             apart = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
             near = np.flatnonzero(apart < shape.reach_m + other.shape.reach_m)
             if len(near):
-                # both ways: nothing of a box's surface lies inside a thing that is in the box
-                T_own_other = se3.inverse(T[near]) @ other.T_world_centre
-                theirs = se3.transform(T_own_other, other.shape.surface_points(_CONTACTS))
-                own = se3.transform(se3.inverse(T_own_other), shape.surface_points(_CONTACTS))
-                both = np.maximum(penetration_depth(shape, theirs), penetration_depth(other.shape, own))
-                deepest[near] = np.maximum(deepest[near], both)
+                depth = penetration_depth(shape, other.shape, se3.inverse(T[near]) @ other.T_world_centre)
+                deepest[near] = np.maximum(deepest[near], depth)
         tolerance = model.config.context.support_tolerance_m
         return hinge_log_potential(deepest - tolerance, model.config.context.penetration_sigma_m)
 
 
-def penetration_depth(shape: Shape, points: Array) -> Array:
-    """How deep the deepest of points (K, P, 3), centre frame, lies inside a shape: (K,) metres, 0 outside."""
-    return np.maximum(-shape.distance.at(points), 0.0).max(axis=-1)
+def penetration_depth(a: Shape, b: Shape, T_a_b: Array) -> Array:
+    """How deep two shapes reach into each other at relative poses (K, 4, 4) of their centre frames: (K,) metres.
+
+    Both ways, as nothing of a box's surface lies inside a thing that is in the box.
+    """
+    theirs = a.distance.deepest(T_a_b, b.surface_points(_CONTACTS))
+    return np.maximum(theirs, b.distance.deepest(se3.inverse(T_a_b), a.surface_points(_CONTACTS)))
 
 
 def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, supports: tuple[Plane, ...]) -> Array:

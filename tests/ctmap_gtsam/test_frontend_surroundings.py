@@ -145,11 +145,12 @@ def test_two_things_in_one_place_are_impossible_and_side_by_side_they_are_not():
     assert (outside.log_potential(MODEL, BOX, standing(BOX)[None]) < -5.0).all()
 
 
-def test_penetration_is_measured_in_metres():
-    points = np.array([[[0.0, 0.0, 0.0], [9.0, 0, 0]], [[9.0, 0, 0], [0, 9.0, 0]]])
-    depth = penetration_depth(BOX, points)
-    assert depth[0] == pytest.approx(np.ptp(BOX.mesh.vertices, axis=0).min() / 2, abs=0.01)
-    assert depth[1] == 0.0
+def test_penetration_is_measured_in_metres_and_alike_from_both_sides():
+    side = np.ptp(BOX.mesh.vertices, axis=0)[0]
+    poses = se3.make(np.tile(np.eye(3), (3, 1, 1)), [[side - 0.02, 0.0, 0.0], [side + 0.01, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    depth = penetration_depth(BOX, BOX, poses)
+    np.testing.assert_allclose(depth, [0.02, 0.0, 0.0], atol=0.003)
+    np.testing.assert_allclose(penetration_depth(BOX, MUG, poses), penetration_depth(MUG, BOX, se3.inverse(poses)))
 
 
 def test_a_thing_of_the_same_kind_nearby_is_welcome_and_a_stranger_is_nothing():

@@ -6,6 +6,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sequences import se3
 from sequences.catalogue import Mesh
 from sequences.distance import distance_field
 from tests.tiny import box_mesh
@@ -115,3 +116,12 @@ def test_a_field_moves_with_its_mesh():
     moved = Mesh(mesh.vertices + shift, mesh.faces, mesh.colours)
     points = points_around(mesh, 5)
     np.testing.assert_allclose(distance_field(moved).at(points + shift), distance_field(mesh).at(points), atol=1e-4)
+
+
+@given(seed=st.integers(0, 2**16))
+def test_the_deepest_point_is_what_the_field_says_of_all(seed):
+    rng = np.random.default_rng(seed)
+    field = distance_field(box_mesh(0.2, 0.1, 0.05))
+    points, poses = rng.normal(0.0, 0.05, (20, 3)), se3.exp(rng.normal(0.0, [0.5, 0.5, 0.5, 0.05, 0.05, 0.05], (7, 6)))
+    said = -field.at(se3.transform(poses, points)).min(axis=-1)
+    np.testing.assert_allclose(field.deepest(poses, points), np.maximum(said, 0.0), atol=1e-7)
