@@ -103,30 +103,32 @@ def product(means: ArrayLike, informations: ArrayLike) -> tuple[Array, Array, Ar
 
 
 def moment_match(
-    T: ArrayLike, covariances: ArrayLike, log_weights: ArrayLike, iterations: int = 10
+    T: ArrayLike, covariances: ArrayLike | None, log_weights: ArrayLike, iterations: int = 10
 ) -> tuple[Array, Array]:
     """One pose and covariance with the first two moments of a mixture on SE(3), in the tangent at its mean.
 
     Args:
         T: (..., K, 4, 4) the modes, symmetric images already brought together.
-        covariances: (..., K, 6, 6) of the right tangent at each mode.
+        covariances: (..., K, 6, 6) of the right tangent at each mode; None for points.
         log_weights: (..., K), of any scale.
         iterations: fixed-point steps for the mean; few modes within a turn of each other need fewer than five.
 
     Returns:
         T_mean (..., 4, 4) and covariance (..., 6, 6).
     """
-    modes, spread = np.asarray(T, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+    modes = np.asarray(T, dtype=np.float64)
     weights = np.exp(normalised(log_weights))[..., None]
     heaviest = np.argmax(weights[..., 0], axis=-1)
     mean = np.take_along_axis(modes, heaviest[..., None, None, None], axis=-3)[..., 0, :, :]
     for _ in range(iterations):
         mean = se3.retract(mean, (weights * se3.local(mean[..., None, :, :], modes)).sum(axis=-2))
     tangents = se3.local(mean[..., None, :, :], modes)
+    between = np.swapaxes(weights * tangents, -1, -2) @ tangents
+    if covariances is None:
+        return mean, between
     J = se3.right_jacobian_inverse(tangents)
-    within = J @ spread @ np.swapaxes(J, -1, -2)
-    between = tangents[..., :, None] * tangents[..., None, :]
-    return mean, (weights[..., None] * (within + between)).sum(axis=-3)
+    within = J @ np.asarray(covariances, dtype=np.float64) @ np.swapaxes(J, -1, -2)
+    return mean, (weights[..., None] * within).sum(axis=-3) + between
 
 
 def null_information(rotation_sigma_rad: float = np.pi, translation_sigma_m: float = 1.0) -> Array:

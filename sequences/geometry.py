@@ -62,10 +62,11 @@ class Plane:
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Whether the feet of points (..., 3) lie within the outline."""
         local = se3.transform(se3.inverse(self.T_frame_plane), points)[..., :2]
-        following = np.roll(self.hull, -1, axis=0)
-        edge, offset = following - self.hull, local[..., None, :] - self.hull
+        within = np.asarray(((local >= self.hull.min(axis=0)) & (local <= self.hull.max(axis=0))).all(axis=-1))
+        edge, offset = np.roll(self.hull, -1, axis=0) - self.hull, local[within][:, None] - self.hull
         side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
-        return np.asarray((side >= 0).all(-1) | (side <= 0).all(-1))
+        within[within] = (side >= 0).all(-1) | (side <= 0).all(-1)
+        return within
 
 
 def find_planes(

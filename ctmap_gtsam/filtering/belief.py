@@ -530,7 +530,7 @@ def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float,
         )
         near &= np.isfinite(left)
         near[heaviest] = True
-        T, covariance = mixture.moment_match(images[near], np.zeros((int(near.sum()), 6, 6)), left[near], iterations=4)
+        T, covariance = mixture.moment_match(images[near], None, left[near], iterations=4)
         free = shape.symmetry.free_axes
         # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
         covariance = covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T

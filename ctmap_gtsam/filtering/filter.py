@@ -89,8 +89,10 @@ class _State:
         reported: dict[int, Reported] = {}
         for i, detection in self._detections(tracks, observation.keyframe).items():
             around = surroundings.without(i)
-            self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
-            reported[i] = self.updater.report(self.beliefs[i], around)
+            belief = self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
+            # what nobody sees is believed to be as it was
+            unseen = not belief.visible and i in before
+            reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
         reported = self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
         for i, r in reported.items():
             self.surest[i] = max(self.surest.get(i, 0.0), r.existence)

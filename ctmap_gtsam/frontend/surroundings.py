@@ -125,14 +125,17 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
     settings = model.config.context
     best = np.full(len(T_world_centre), -np.inf)
     for plane in supports:
-        heights = se3.transform(T_world_centre, shape.hull_points) @ plane.normal - plane.offset
+        above = plane.contains(T_world_centre[:, :3, 3])
+        if not above.any():
+            continue
+        # the normal in the shape's own axes: heights of all its points without moving them
+        along = plane.normal @ T_world_centre[:, :3, :3]
+        heights = along @ shape.hull_points.T + (T_world_centre[:, :3, 3] @ plane.normal - plane.offset)[:, None]
         low, high = heights.min(axis=-1), heights.max(axis=-1)
         floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
         sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
         potential = np.logaddexp(floating, np.log(settings.other_support)) + sinking
-        concerned = (
-            plane.contains(T_world_centre[:, :3, 3]) & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
-        )
+        concerned = above & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
         best = np.where(concerned, np.maximum(best, potential), best)
     return np.where(np.isneginf(best), 0.0, best)
 
