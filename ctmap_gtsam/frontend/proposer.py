@@ -224,13 +224,13 @@ class Proposer:
         the depth already; its boxes come less often, and fit as well.
         """
         detector = self.model.config.detector
+        if view.detection is None:
+            return view.share * float(np.log1p(-detector.clutter_rate))
         rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
         z, background, sensor = view.tile.depth, view.tile.background, self.model.config.sensor
-        there = (rendered > 0) & (z > 0) & (np.abs(z - rendered) < shape.radius_m)
+        seen = (rendered > 0) & (z > rendered - sensor.occlusion_margin_m)
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((there & surprising).sum())
-        if view.detection is None:
-            return view.share * (gain + float(np.log1p(-detector.clutter_rate)))
+        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
         box = np.array(view.detection.box)
         matched = float(self.model.box(box, box[None], view.image_size)[0])
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)

@@ -20,7 +20,9 @@ from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
 from factors.mixture import log_sum
+from factors.symmetry import residual
 from sequences.geometry import Plane
 from sequences.progress import Progress
 from sequences.seeds import generator
@@ -30,6 +32,9 @@ Array = NDArray[np.float64]
 
 _WORTH_A_SEARCH = 30.0
 """nats behind the best class of the views before beyond which a class isn't searched for any more"""
+
+_KEPT = 8  # poses of a class that a track starts from, at most
+_ONE_POSE = (0.15, 0.015)  # rad, metres: what searches in several images find nearer to each other is found once
 
 
 @dataclass(frozen=True)
@@ -90,9 +95,23 @@ class Found:
     """What the full searches found of one track."""
 
     poses: dict[int, Array]
-    """class index -> (n, 4, 4) T_world_centre"""
+    """class index -> (n, 4, 4) T_world_centre, all apart from each other, the best first"""
+    scores: dict[int, Array]
+    """class index -> (n,) log-likelihood of each in the view that it was found in"""
     log_likelihood: Array
     """(C,) of the best pose of each search, summed: what the searched views say of the class"""
+
+    def join(self, shape: Shape, poses: Array, scores: Array) -> None:
+        """Take in poses (n, 4, 4) T_world_centre of a class that one search found, with their log-likelihoods (n,)."""
+        poses = np.concatenate([self.poses[shape.index], poses])
+        scores = np.concatenate([self.scores[shape.index], scores])
+        kept: list[int] = []
+        for row in np.argsort(-scores, kind="stable"):
+            r = residual(poses[kept], poses[row], shape.symmetry)
+            turned, moved = np.linalg.norm(r[:, :3], axis=-1), np.linalg.norm(r[:, 3:], axis=-1)
+            if not ((turned < _ONE_POSE[0]) & (moved < _ONE_POSE[1])).any():
+                kept.append(int(row))
+        self.poses[shape.index], self.scores[shape.index] = poses[kept[:_KEPT]], scores[kept[:_KEPT]]
 
     def within(self, nats: float) -> list[int]:
         """Classes that come so near to the best."""
@@ -118,7 +137,11 @@ def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[i
     chosen = {t.track_id: _spread(t.keyframes, model.config.smoother.searches) for t in recording.tracks}
     at = sorted({k for keyframes in chosen.values() for k in keyframes})
     found = {
-        t.track_id: Found({s.index: np.zeros((0, 4, 4)) for s in model.shapes}, np.zeros(len(model.shapes)))
+        t.track_id: Found(
+            {s.index: np.zeros((0, 4, 4)) for s in model.shapes},
+            {s.index: np.zeros(0) for s in model.shapes},
+            np.zeros(len(model.shapes)),
+        )
         for t in recording.tracks
     }
     with progress.stage("search", total=sum(map(len, chosen.values()))) as stage:
@@ -144,8 +167,7 @@ def _search(found: Found, track: Track, observation: Observation, place: Place, 
         rng = generator(model.config.seed, stage, track.track_id, observation.frame.index)
         starts = proposer.search(shape, view, observation, around, rng, model.config.smoother.search_share)
         modes = proposer.modes(shape, view, starts, probe=False)
-        poses = observation.frame.T_world_camera @ modes.T_camera_centre
-        found.poses[shape.index] = np.concatenate([found.poses[shape.index], poses])
+        found.join(shape, observation.frame.T_world_camera @ modes.T_camera_centre, modes.log_likelihood)
         # a class that explains nothing here says as much as nothing being here
         found.log_likelihood[shape.index] += max(log_evidence(modes), 0.0)
 

@@ -5,13 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses
+from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses, shifted_poses, snapped_poses
 from sequences import se3
 from sequences.geometry import Plane
 from tests.ctmap_gtsam.scenes import CAMERA, UP, looking, model_of, shape_named, standing
 
 NAMES = ("mug", "cereal_box", "hammer")
 MODEL = model_of(*NAMES)
+FURNITURE = model_of("shelf", "cabinet")
 
 
 def level(height):
@@ -87,3 +88,70 @@ def test_rests_are_rotations_in_which_a_face_of_the_hull_lies_level(name):
 def test_poses_behind_the_camera_are_left_out():
     up = looking(0.0, 0.8, -0.9)  # looks up: the surface is below and behind
     assert len(drawn("mug", up, (level(-5.0),))) == 0
+
+
+def planes_of(shape, T_camera_centre, n=4):
+    """The largest flat parts of a thing that face the camera, as planes in the camera frame."""
+    R, t = T_camera_centre[:3, :3], T_camera_centre[:3, 3]
+    found = []
+    for flat in shape.flats:
+        normal = R @ flat[:3]
+        offset = float(flat[3] + normal @ t)
+        if offset < -0.05:  # towards the camera at the origin
+            found.append(Plane(normal, offset, np.eye(4), np.eye(2), 0.1))
+    return tuple(found[:n])
+
+
+def apart(shape, poses, plane):
+    """(n,) metres from a plane to the nearest flat part that faces as it does; inf where none does."""
+    facing = np.einsum("nij,fj,i->nf", poses[:, :3, :3], shape.flats[:, :3], plane.normal) > 0.98
+    away = np.abs((plane.offset - poses[:, :3, 3] @ plane.normal)[:, None] - shape.flats[:, 3])
+    return np.where(facing, away, np.inf).min(axis=-1)
+
+
+def test_the_flats_of_a_box_are_its_six_sides():
+    shape = shape_named(MODEL, "cereal_box")
+    assert len(shape.flats) == 6
+    np.testing.assert_allclose(np.linalg.norm(shape.flats[:, :3], axis=-1), 1.0)
+    half = np.ptp(shape.mesh.vertices, axis=0) / 2
+    np.testing.assert_allclose(shape.flats[:, 3], np.abs(shape.flats[:, :3]) @ half, atol=0.005)
+    # the largest first: the front and the back
+    assert np.abs(shape.flats[:2, :3] @ shape.main_normal).min() > 0.99
+
+
+def test_every_flat_lies_on_the_surface_and_nothing_of_it_before_a_hulls():
+    for shape in FURNITURE.shapes:
+        for normal, offset in zip(shape.flats[:, :3], shape.flats[:, 3], strict=True):
+            assert np.abs(shape.mesh.vertices @ normal - offset).min() < 0.01
+            assert offset < (shape.mesh.vertices @ normal).max() + 0.01
+
+
+@pytest.mark.parametrize("name", ["shelf", "cabinet"])
+def test_poses_drawn_to_planes_have_a_flat_in_them_and_come_near_the_truth(name):
+    shape = shape_named(FURNITURE, name)
+    T_world_camera = looking(0.4, 1.6, 0.4)
+    truth = se3.inverse(T_world_camera) @ standing(shape)
+    planes = planes_of(shape, truth)
+    assert len(planes) >= 3
+    rng = np.random.default_rng(0)
+    centres = truth[:3, 3] + rng.uniform(-0.3, 0.3, (2000, 3))
+    up = T_world_camera[:3, :3].T @ UP
+    poses = snapped_poses(shape, centres, planes, up, rng.random((2000, UNIFORMS)), rng)
+    off = np.stack([apart(shape, poses, plane) for plane in planes])
+    assert (off < 1e-6).any(axis=0).mean() > 0.7
+    near = np.linalg.norm(poses[:, :3, 3] - truth[:3, 3], axis=-1) < 0.02
+    alike = np.einsum("nij,ij->n", poses[:, :3, :3], truth[:3, :3]) > 2.9
+    assert (near & alike).any()
+
+
+def test_a_shelf_taken_for_the_board_above_is_shifted_back():
+    shape = shape_named(FURNITURE, "shelf")
+    T_world_camera = looking(0.4, 1.6, 0.4)
+    truth = se3.inverse(T_world_camera) @ standing(shape)
+    boards = shape.flats[shape.flats[:, 2] > 0.99, 3]
+    wrong = truth.copy()
+    wrong[:3, 3] += (boards[0] - boards[1]) * (truth[:3, :3] @ [0.0, 0.0, 1.0])
+    assert np.linalg.norm(wrong[:3, 3] - truth[:3, 3]) > 0.2
+    shifted = shifted_poses(shape, wrong[None], planes_of(shape, truth, n=16))
+    assert np.linalg.norm(shifted[:, :3, 3] - truth[:3, 3], axis=-1).min() < 0.01
+    np.testing.assert_allclose(shifted[:, :3, :3], np.broadcast_to(wrong[:3, :3], (len(shifted), 3, 3)))

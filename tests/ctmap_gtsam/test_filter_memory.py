@@ -1,0 +1,84 @@
+"""Laws of the views that the filter keeps, and of poses that are found late."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctmap_gtsam.filtering.belief import ClassBelief, Updater
+from ctmap_gtsam.filtering.memory import Memory
+from ctmap_gtsam.filtering.particles import Particles
+from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.surroundings import Surroundings
+from sequences import se3
+from sequences.types import LocalisationNoise
+from tests.ctmap_gtsam.scenes import CHEAP, config_of, looking, model_of, shape_named, standing, view_of
+
+CONFIG = config_of(*CHEAP, "filter.search_every=1", "filter.search_share=1.0")
+MODEL = model_of("mug", "soup_can", "cereal_box", config=CONFIG)
+MUG = shape_named(MODEL, "mug")
+TRUTH = standing(MUG, 0.0, 0.0, 0.5)
+ALONE = Surroundings((), ())
+
+
+def seen(k):
+    return view_of(MODEL, [(MUG, TRUTH)], looking(0.15 * k - 0.3, 0.7, 0.7), k)
+
+
+def looked_at(proposer, k):
+    observation = seen(k)
+    detection = observation.frame.detections[0]
+    return proposer.view(observation, np.array(detection.box), detection, ALONE), observation.frame.T_camera_world
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(0.01, 1.0), min_size=1, max_size=40))
+def test_the_views_that_are_kept_stand_for_all(shares):
+    view, T = looked_at(Proposer(MODEL), 0)
+    memory = Memory()
+    for share in shares:
+        memory = memory.joined(replace(view, share=share), T)
+    assert sum(v.share for v, _ in memory.views) + memory.pending == pytest.approx(sum(shares))
+    assert len(memory.views) <= 10
+
+
+def test_the_true_pose_explains_all_views_and_one_elsewhere_none():
+    proposer, memory = Proposer(MODEL), Memory()
+    for k in range(4):
+        memory = memory.joined(*looked_at(proposer, k))
+    reach = np.array([0.02, 0.01])
+    true = memory.log_likelihood(proposer, MUG, TRUTH, reach)
+    assert true > 50.0
+    elsewhere = TRUTH.copy()
+    elsewhere[:3, 3] += [0.05, 0.03, 0.0]
+    assert memory.log_likelihood(proposer, MUG, elsewhere, reach) < 0.5 * true
+    # an error of the localisation is forgiven, as far as it goes
+    beside = TRUTH.copy()
+    beside[:3, 3] += [0.006, 0.0, 0.0]
+    forgiven = memory.log_likelihood(proposer, MUG, beside, reach)
+    assert forgiven > memory.log_likelihood(proposer, MUG, beside, np.zeros(2))
+    assert Memory().log_likelihood(proposer, MUG, TRUTH, reach) == 0.0
+
+
+def test_a_class_that_was_not_found_at_first_is_believed_once_it_is():
+    """Its evidence is that of all views, not of those since it was found."""
+    updater = Updater(MODEL, Proposer(MODEL), LocalisationNoise())
+    first = seen(0)
+    track = Track(0, (0,), (first.frame.detections[0],), 0)
+    belief = updater.start(track, first, ALONE, updater.search(track, first, ALONE))
+    assert np.argmax(belief.class_log_evidence(MODEL)) == MUG.index
+    far_off = se3.make(TRUTH[:3, :3], TRUTH[:3, 3] + [0.0, 0.0, 0.08])
+    lost = ClassBelief(Particles(np.tile(far_off, (24, 1, 1)), np.full(24, -np.log(24.0))), -200.0)
+    classes = tuple(lost if c == MUG.index else own for c, own in enumerate(belief.classes))
+    # a class so far behind sleeps most of the time
+    belief = replace(belief, classes=classes, steps=14, searched=13)
+    assert np.argmax(belief.class_log_evidence(MODEL)) != MUG.index
+    for k in range(1, 5):
+        observation = seen(k)
+        belief = updater.step(belief, observation.frame.detections[0], observation, ALONE)
+    assert np.argmax(belief.class_log_evidence(MODEL)) == MUG.index
+    own = belief.classes[MUG.index]
+    assert np.linalg.norm(own.particles.best(1)[0, :3, 3] - TRUTH[:3, 3]) < 0.01
