@@ -40,6 +40,7 @@ _SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
 _UNLIKE = 0.4  # sizes of which one is less than this share of the other don't belong together
 _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
+_EDGES = 4.0  # of a box
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
 
@@ -232,7 +233,8 @@ class Proposer:
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
         gain = view.samples * self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
         box = np.array(view.detection.box)
-        matched = float(self.model.box(box, box[None], view.image_size)[0])
+        # its boxes jitter, too, about one that nobody knows: a nat is what an edge of Laplace's density expects to lose
+        matched = float(self.model.box(box, box[None], view.image_size)[0]) - _EDGES
         return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
 
     def _draw(
