@@ -135,6 +135,24 @@ def detector(
     _figures("detector", json_file, config_file or SETTINGS, assignments, seed, seeds=chosen)
 
 
+@bench_app.command()
+def highlight(
+    out: Out,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """The paper's highlight figure on simulated cases (synthetic): what a map corrects of the detector's errors.
+
+    Loofah to bowl by depth, milk to shampoo by context, a table that is missed under its cloth. Writes
+    DIR/highlight.png; the figures say what each method makes of the thing in question.
+
+    Example: `ctmap bench highlight --out highlight`
+    """
+    _figures("highlight", json_file, config_file, assignments, seed, out=writable(out))
+
+
 def _figures(
     name: str,
     json_file: Path | None,
