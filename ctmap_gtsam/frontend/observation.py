@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 CENTRE_REGION = 0.3
 """share of a box's width and height that the paper's "center region" spans"""
 
-OWN_SHARE = 0.5
+OWN_SHARE = 0.8
 """a plane with more than this share of what the image shows of it in an object's box may be the object's own face"""
 
 _GRID = 40  # samples across the image for telling where a plane lies
