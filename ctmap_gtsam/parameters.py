@@ -81,7 +81,7 @@ class Frontend:
     start_after: int = option(3, "consistent frames before a track is estimated", low=1)
     lost_after_s: float = option(2.0, "a track not yet started is given up after so long without a box, s", low=0.0)
     angular_step_rad: float = option(0.0075, "depth is sampled at this step", low=1e-4)
-    tile_samples: int = option(1600, "at most so many in a region: what is larger is sampled more coarsely", low=64)
+    tile_samples: int = option(6400, "at most so many in a region: what is larger is sampled more coarsely", low=64)
     region_margin: float = option(0.5, "depth is scored in the box enlarged by this share on each side", low=0.0)
     mesh_faces: int = option(500, "triangles of the meshes that score", low=20)
     fresh_poses: int = option(1000, "random poses a class in a full search", low=1)

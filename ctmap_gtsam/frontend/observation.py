@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sequences import se3
 from sequences.camera import Camera
-from sequences.geometry import Plane, find_planes, plane_depth, up_from_planes
+from sequences.geometry import Plane, PlaneSearch, find_planes, plane_depth, up_from_planes
 from sequences.seeds import generator
 from sequences.types import Frame, Run
 
@@ -45,7 +45,8 @@ class Observation:
 
     def planes_behind(self, box: Array) -> tuple[Plane, ...]:
         """The planes that may stand behind a thing with a box (x, y, w, h): those that aren't a face of its own."""
-        return tuple(p for p, where in zip(self.planes, self._where, strict=True) if reaches_beyond(where, box))
+        views = zip(self.planes, self._where, strict=True)
+        return tuple(p for p, where in views if reaches_beyond(p, where, box, self.frame.camera))
 
     @cached_property
     def _where(self) -> tuple[Array, ...]:
@@ -95,9 +96,11 @@ def where_in_image(plane: Plane, camera: Camera) -> Array:
     return np.stack([u, v], axis=-1).astype(np.float64) * step
 
 
-def reaches_beyond(where: Array, box: Array) -> bool:
-    """Whether a plane seen at pixels (n, 2) lies mostly outside of a box (x, y, w, h)."""
+def reaches_beyond(plane: Plane, where: Array, box: Array, camera: Camera) -> bool:
+    """Whether a plane in the camera frame, seen at pixels (n, 2), reaches well beyond a box (x, y, w, h)."""
     if not len(where):
         return True
-    inside = ((where >= box[:2]) & (where <= box[:2] + box[2:])).all(axis=-1)
+    # outlines are wider than what was seen by a margin
+    margin = PlaneSearch().margin_m * camera.fx / max(plane.T_frame_plane[2, 3], 0.1)
+    inside = ((where >= box[:2] - margin) & (where <= box[:2] + box[2:] + margin)).all(axis=-1)
     return bool(inside.mean() <= OWN_SHARE)

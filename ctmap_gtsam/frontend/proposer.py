@@ -37,6 +37,7 @@ _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
 """steps at which the score's shape is probed, metres at the object's radius"""
 _CLIMBS, _CLIMB_NATS = 6, 0.05  # at most so many moves on the score, each gaining at least this much
 _SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
+_LARGE_SAMPLES = 0.25  # of the configured samples, as many as tell where furniture is as well as all of them
 _UNLIKE = 0.4  # sizes of which one is less than this share of the other don't belong together
 _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
@@ -123,7 +124,9 @@ class Proposer:
         region = np.array([x - margin * w, y - margin * h, x + (1 + margin) * w, y + (1 + margin) * h])
         step = max(1, round(camera.fx * self.settings.angular_step_rad))
         low, high = np.clip(region.reshape(2, 2), 0.0, [camera.width, camera.height])
-        by = max(1, int(np.ceil(np.sqrt((high - low).prod() / (step**2 * self.settings.tile_samples)))))
+        seen_m = float(np.hypot(w, h)) * centre_depth(observation.depth, box) / camera.fx
+        samples = self.settings.tile_samples * (_LARGE_SAMPLES if seen_m > 2.0 * _SMALL_REACH_M else 1.0)
+        by = max(1, int(np.ceil(np.sqrt((high - low).prod() / (step**2 * samples)))))
         tile = cut_tile(camera, observation.depth, observation.planes_behind(box), region, by * step)
         if surroundings is not None:
             tile = surroundings.behind(surroundings.beneath(tile, observation.frame, box), observation.frame)

@@ -68,7 +68,8 @@ class Surroundings:
     def beneath(self, tile: Tile, frame: Frame, box: Array) -> Tile:
         """The tile of a thing with a box (x, y, w, h), with known surfaces behind where this image alone shows none."""
         surfaces = (s.moved(frame.T_camera_world) for s in self.supports)
-        others = tuple(s for s in surfaces if reaches_beyond(where_in_image(s, frame.camera), box))
+        camera = frame.camera
+        others = tuple(s for s in surfaces if reaches_beyond(s, where_in_image(s, camera), box, camera))
         known = plane_depth(others, tile.camera)
         return replace(tile, background=np.where(tile.background > 0, tile.background, known))
 

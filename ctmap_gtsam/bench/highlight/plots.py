@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from ctmap_gtsam.bench.highlight.answers import Answer, Word
 from ctmap_gtsam.estimate import Snapshot
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 Window = tuple[float, float, float, float]
 """x, y, width, height of the part of the image that is shown, pixels"""
 
-RIGHT, WRONG, MISSED = "#1b9e3e", "#d7191c", "#c9cdd3"
+RIGHT, WRONG, MISSED = "#1b9e3e", "#d7191c", "#747b84"
 SUBJECT = "#ffd400"
 COLUMNS = (
     ("detector", "(a) detector"),
@@ -33,14 +34,16 @@ COLUMNS = (
 )
 POSES = "(d) CT-Map, 6-DoF poses"
 CAPTION = (
-    "Simulated places (synthetic). Green: a box on a true thing of its class. Red: any other. Grey, dashed: nothing is "
-    "on a true thing. Yellow: the thing in question. What the detector says of that thing is set, what it says of all "
-    "else is the simulator's.\n(b) to (d): the map at the end of the visit, seen from this image's camera; numbers are "
-    "P(exists) P(class). (d) leaves out furniture that is not in question; above it is the error of the pose."
+    "Simulated places (synthetic). Green: a box on a true thing of its class. Red: any other. Grey, dashed: no box is "
+    "on a true thing. Yellow: the thing in question.\n"
+    "What the detector says of that thing is set, what it says of all else is the simulator's. (b) to (d): the map at "
+    "the end of the visit, seen from this image's camera;\nnumbers are P(exists) P(class). (d) leaves out furniture "
+    "that is not in question; above it is the error of the pose of the thing in question."
 )
 WINDOW_SHARE = 0.62  # of the image's width, around a small thing; what fills most of it is shown whole
-PANEL_IN, TITLE_IN, FOOT_IN = 4.2, 0.75, 0.6
-FONT, DPI = 8.5, 110
+PANEL_IN, TITLE_IN, FOOT_IN = 4.2, 0.75, 0.75
+FONT, DPI = 8.5, 100
+PALETTE = 256  # colours of the file, a third of the size that all would have
 GAP_PX = 3.0  # between a label and its box
 
 
@@ -59,9 +62,11 @@ def write_figure(path: Path, played: Sequence[Played]) -> None:
     for row, one in zip(grid, played, strict=True):
         _draw_row(row, one)
     figure.text(0.005, 0.1 * FOOT_IN / height, CAPTION, fontsize=9.5, color="0.25", va="bottom", linespacing=1.35)
-    image = BytesIO()
-    figure.savefig(image, format="png", dpi=DPI)
-    write_bytes(path, image.getvalue())
+    drawn, small = BytesIO(), BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI)
+    with Image.open(drawn) as image:
+        image.convert("RGB").quantize(PALETTE).save(small, format="png", optimize=True)
+    write_bytes(path, small.getvalue())
 
 
 def _draw_row(row: NDArray[Any], one: Played) -> None:
@@ -167,7 +172,7 @@ def _label(axes: Axes, text: str, box: Box, colour: str, window: Window, taken: 
     x, y, width, height = place = label_place(box, size, window, taken)
     axes.text(
         x + width / 2, y + height / 2, text, fontsize=FONT, ha="center", va="center",
-        color="0.15" if colour == MISSED else "white",
+        color="white",
         bbox={"boxstyle": "round,pad=0.18", "facecolor": colour, "edgecolor": "none", "alpha": 0.92},
     )  # fmt: skip
     return place

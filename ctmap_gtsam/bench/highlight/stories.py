@@ -33,7 +33,7 @@ from sequences.types import Detection
 
 FRAMES = 16
 FOUND_SHARE = 0.25  # of the images: in so many, the first that show it, the detector finds what it misses in all others
-NEAR_M = 0.4  # things so near each other stand beside each other
+NEAR_M = 0.3  # things so near each other stand beside each other
 PLAIN = 0.5  # the evidence (`Visible.evidence`) of a thing in plain view
 LEAST_SHARE = 0.35  # of the images show the thing, and what stands beside it, in plain view ...
 LEAST_SHARE_MISSED = 0.5  # ... and so many one that is missed in most
