@@ -1,7 +1,6 @@
 """Laws of the marginal particle filter: densities are those of the draws, and where all is Gaussian it is Kalman's."""
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +91,18 @@ def test_the_heaviest_come_first_and_ties_in_order():
     assert Particles(T, np.full(4, np.log(0.25))).effective == pytest.approx(4.0)
 
 
+@dataclass(frozen=True)
+class Look:
+    """A view that is nothing but its keyframe."""
+
+    detection: Detection | None
+    k: int
+    share: float
+
+    def coarse(self):
+        return self
+
+
 @dataclass
 class GaussianProposer:
     """A proposer whose images are Gaussians about measured poses; frames without one say nothing."""
@@ -100,7 +111,7 @@ class GaussianProposer:
     covariance: dict[int, np.ndarray]
 
     def view(self, observation, box, detection, surroundings=None, share=1.0):
-        return SimpleNamespace(detection=detection, k=observation.keyframe, share=share)
+        return Look(detection, observation.keyframe, share)
 
     def search(self, shape, view, observation, surroundings, rng, share=1.0):
         return np.zeros((0, 4, 4))
@@ -121,6 +132,9 @@ class GaussianProposer:
             return np.zeros(len(T)), in_sight(len(T))
         r = coordinates(T) - coordinates(self.measured[view.k])
         return mixture.gaussian_log_density(r, np.linalg.inv(self.covariance[view.k])), in_sight(len(T))
+
+    def near(self, shape, view, T, reach):
+        return float(self.score(shape, view, T[None])[0][0])
 
     def log_clutter(self, shape, view, T):
         return 0.0
