@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmap_gtsam.frontend.observation import Observation
+from ctmap_gtsam.frontend.observation import Observation, reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings, penetration_depth, support_log_potential
 from ctmap_gtsam.frontend.visibility import outlook
 from sequences import se3
-from sequences.geometry import Plane
+from sequences.geometry import Plane, PlaneSearch
 from tests.ctmap_gtsam.scenes import (
     CAMERA,
     UP,
@@ -271,3 +271,19 @@ def test_a_face_of_ones_own_is_no_background_and_the_table_is():
     assert any(p.normal @ up > 0.95 and abs(p.moved(camera).offset) < 0.01 for p in behind)
     everything = observation.planes_behind(np.zeros(4))
     assert everything == observation.planes
+
+
+def level_patch(half_m, z):
+    """A level patch before a camera that looks straight down on it."""
+    hull = half_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    T = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, z])
+    return Plane(np.array([0.0, 0.0, -1.0]), -z, T, hull, 0.3)
+
+
+@pytest.mark.parametrize("seen_of_it", [1.0, 0.6])
+def test_a_plane_is_a_things_own_where_all_of_it_is_in_the_box_margin_aside(seen_of_it):
+    top = level_patch(0.1 + PlaneSearch().margin_m, 0.8)  # outlines reach beyond what was seen
+    half = 0.1 * CAMERA.fx / 0.8
+    where = where_in_image(top, CAMERA)
+    box = np.array([CAMERA.cx - half, CAMERA.cy - half, 2.0 * half * seen_of_it, 2.0 * half])
+    assert reaches_beyond(top, where, box, CAMERA) == (seen_of_it < 1.0)
