@@ -65,7 +65,7 @@ def write_figure(path: Path, played: Sequence[Played]) -> None:
     drawn, small = BytesIO(), BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
     with Image.open(drawn) as image:
-        image.convert("RGB").quantize(PALETTE).save(small, format="png", optimize=True)
+        image.convert("RGB").quantize(PALETTE, kmeans=2).save(small, format="png", optimize=True)
     write_bytes(path, small.getvalue())
 
 

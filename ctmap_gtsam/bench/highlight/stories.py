@@ -63,6 +63,8 @@ class Story:
     """how many of these are of the same class as another"""
     beside: int = 0
     """things of its own category that stand beside it, at least"""
+    distance_m: float | None = None
+    """from the camera to what it looks at, where the story needs another than the settings'"""
     cloth: bool = False
     """whether it, and no other furniture, is under a cloth"""
 
@@ -73,6 +75,7 @@ class Story:
 
     def settings(self, simulation: SimulationConfig) -> SimulationConfig:
         """The simulator's, with what the story needs: one short visit to a tidy place of its kind."""
+        distance_m = simulation.trajectory.distance_m if self.distance_m is None else self.distance_m
         needs = (
             f'place.kind="{self.kind}"',
             f"place.objects={self.objects}",
@@ -83,6 +86,7 @@ class Story:
             "motion.visits=1",
             "motion.moves=0",
             "motion.nudges=0",
+            f"trajectory.distance_m={distance_m}",
             f"trajectory.frames={min(simulation.trajectory.frames, FRAMES)}",
         )
         return merge(simulation, parse_assignments(needs), "the story")
@@ -109,6 +113,7 @@ STORIES = (
         objects=8,
         twins=2,
         beside=4,
+        distance_m=1.3,  # from 1 m depth alone mostly tells the two apart
     ),
     Story(
         name="table",
