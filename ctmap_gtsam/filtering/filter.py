@@ -18,7 +18,7 @@ from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
-from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to
+from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
@@ -96,7 +96,7 @@ class _State:
         reported = self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
         for i, r in reported.items():
             self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
-        self.reports.append(self._find_moved(reported))
+        self.reports.append(self._find_moved(self._merge(reported)))
 
     def _detections(self, tracks: tuple[Track, ...], keyframe: int) -> dict[int, Detection | None]:
         """Every object's detection, the surest where several of its tracks have one."""
@@ -140,6 +140,21 @@ class _State:
                 self.beliefs[owner] = replace(started[i], object_id=owner)
                 there[owner] = report
         return there
+
+    def _merge(self, reported: dict[int, Reported]) -> dict[int, Reported]:
+        """Objects of one class that have come to one place go on as the older, with what has more evidence."""
+        kept: dict[int, Reported] = {}
+        for i in sorted(reported, key=lambda i: (-reported[i].log_evidence, i)):
+            same = twin(reported[i], kept, self.model)
+            if same is None:
+                kept[i] = reported[i]
+                continue
+            old, young = sorted((i, same), key=lambda j: (self.beliefs[j].first_ns, j))
+            kept[old] = kept.pop(same)
+            self.beliefs[old] = replace(self.beliefs[same], object_id=old, first_ns=self.beliefs[old].first_ns)
+            del self.beliefs[young]
+            self.owner |= {track: old for track, owner in self.owner.items() if owner == young}
+        return dict(sorted(kept.items()))
 
     def _find_moved(self, reported: dict[int, Reported]) -> dict[int, Reported]:
         """Objects whose place was found empty and that are met elsewhere go on there."""

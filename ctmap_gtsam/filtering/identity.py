@@ -1,7 +1,8 @@
 """Which tracks are one object: causally, from the beliefs of a keyframe.
 
-A track that starts where an object is known to be is that object, met again on another box. A track of the same class
-that starts elsewhere, after an object was last seen at its place and that place was found empty, is that object, moved.
+A track that starts where an object is known to be is that object, met again on another box; and two objects of one
+class that come to be in one place are one. A track of the same class that starts elsewhere, after an object was last
+seen at its place and that place was found empty, is that object, moved.
 """
 
 from __future__ import annotations
@@ -36,6 +37,12 @@ def at_place(track_report: Reported, objects: Mapping[int, Reported], model: Mod
         if apart < min(_ONE_PLACE * radius, closest):
             nearest, closest = i, apart
     return nearest
+
+
+def twin(report: Reported, objects: Mapping[int, Reported], model: Model) -> int | None:
+    """The object of the same class in the same place; None where there is none, or either may not exist."""
+    there = {i: r for i, r in objects.items() if r.existence > 0.5 and r.best_class == report.best_class}
+    return at_place(report, there, model) if report.existence > 0.5 else None
 
 
 def moved_to(

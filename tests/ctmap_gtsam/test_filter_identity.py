@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctmap_gtsam.filtering.belief import Reported
-from ctmap_gtsam.filtering.identity import at_place, moved_to
+from ctmap_gtsam.filtering.identity import at_place, moved_to, twin
 from sequences import se3
 from tests.ctmap_gtsam.scenes import model_of
 
@@ -33,6 +33,15 @@ def test_a_track_in_an_objects_place_is_that_object_whatever_its_class():
     assert at_place(report(0.295, classes=(0.2, 0.8)), known, MODEL) == 7
     assert at_place(report(0.15), known, MODEL) is None
     assert at_place(report(0.0), {}, MODEL) is None
+
+
+def test_two_of_one_class_in_one_place_are_one_and_of_two_classes_are_not():
+    known = {3: report(0.0), 7: report(0.3, 0.2)}
+    assert twin(report(0.005), known, MODEL) == 3
+    assert twin(report(0.005, classes=(0.1, 0.9)), known, MODEL) is None
+    assert twin(report(0.005, 0.2), known, MODEL) is None  # what may not exist is nobody's twin
+    assert twin(report(0.3), known, MODEL) is None
+    assert twin(report(0.15), known, MODEL) is None
 
 
 def test_what_vanished_is_found_as_what_began_later_and_is_of_its_class():
