@@ -28,7 +28,7 @@ SMALL = replace(
     trajectory=replace(TINY.trajectory, frames=6, period_s=0.5),
     detector=replace(TINY.detector, noise=0.4),  # it seldom misses a thing in all of so few images
 )
-SEEDS = {"bowl": 3, "shampoo": 9, "table": 0}  # their places are soon found
+SEEDS = {"bowl": 3, "shampoo": 7, "table": 0}  # their places are soon found
 HELD = ("bowl", "table")  # one of each kind of error is held to what the simulator says
 
 

@@ -64,8 +64,11 @@ def write_figure(path: Path, played: Sequence[Played]) -> None:
     figure.text(0.005, 0.1 * FOOT_IN / height, CAPTION, fontsize=9.5, color="0.25", va="bottom", linespacing=1.35)
     drawn, small = BytesIO(), BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
-    with Image.open(drawn) as image:
-        image.convert("RGB").quantize(PALETTE, kmeans=2).save(small, format="png", optimize=True)
+    with Image.open(drawn) as opened:
+        image = opened.convert("RGB")
+    few = image.resize((image.width // 4, image.height // 4), Image.Resampling.NEAREST)  # enough to choose colours by
+    palette = few.quantize(PALETTE, kmeans=1)
+    image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
     write_bytes(path, small.getvalue())
 
 
