@@ -163,6 +163,15 @@ def residual(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, informat
     return _shortest(*_pairs(T_a, T_b), symmetry, information)[0]
 
 
+def near(
+    T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry, rotation_rad: float, translation_m: float
+) -> NDArray[np.bool_]:
+    """Whether poses (..., 4, 4), which broadcast, are one but for less than a turn and a shift: (...)."""
+    r = residual(T_a, T_b, symmetry)
+    turned, moved = np.linalg.norm(r[..., :3], axis=-1), np.linalg.norm(r[..., 3:], axis=-1)
+    return np.asarray((turned < rotation_rad) & (moved < translation_m))
+
+
 def residual_jacobians(
     T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, information: ArrayLike | None = None
 ) -> tuple[Array, Array, Array]:

@@ -412,7 +412,7 @@ class Updater:
             rng: draws particles around the new pose.
         """
         T = found.T_world_centre[0]
-        if own is not None and _same_pose(own.particles.best(1)[0], T, shape):
+        if own is not None and symmetry.near(own.particles.best(1)[0], T, shape.symmetry, *_MODE_RADIUS):
             return own
         mode = Gaussians(found.T_world_centre[:1], found.covariance[:1], np.zeros(1))
         remembered = self._remembered(belief, shape, T)
@@ -507,12 +507,6 @@ class Updater:
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
-
-
-def _same_pose(a: Array, b: Array, shape: Shape) -> bool:
-    """Whether two poses (4, 4) are one mode."""
-    r = symmetry.residual(a[None], b, shape.symmetry)[0]
-    return bool(np.linalg.norm(r[:3]) < _MODE_RADIUS[0] and np.linalg.norm(r[3:]) < _MODE_RADIUS[1])
 
 
 def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:

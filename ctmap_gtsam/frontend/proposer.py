@@ -19,7 +19,7 @@ from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from factors.symmetry import residual
+from factors.symmetry import near
 from sequences import se3
 from sequences.rendering.rasteriser import Rasteriser
 from sequences.types import Detection
@@ -43,7 +43,7 @@ _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _EDGES = 4.0  # of a box
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
-_SAME_ROTATION_RAD, _SAME_TRANSLATION_M = 0.12, 0.008
+_ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,8 @@ class View:
     detection: Detection | None
     image_size: tuple[int, int]
     """width, height"""
+    centre_depth_m: float
+    """median in the middle of the box that was looked in; 0 where nothing was measured"""
     share: float = 1.0
     """of the view that is news: its evidence is raised to this power"""
     samples: int = 1
@@ -124,13 +126,14 @@ class Proposer:
         region = np.array([x - margin * w, y - margin * h, x + (1 + margin) * w, y + (1 + margin) * h])
         step = max(1, round(camera.fx * self.settings.angular_step_rad))
         low, high = np.clip(region.reshape(2, 2), 0.0, [camera.width, camera.height])
-        seen_m = float(np.hypot(w, h)) * centre_depth(observation.depth, box) / camera.fx
+        z = centre_depth(observation.depth, box)
+        seen_m = float(np.hypot(w, h)) * z / camera.fx
         samples = self.settings.tile_samples * (_LARGE_SAMPLES if seen_m > 2.0 * _SMALL_REACH_M else 1.0)
         by = max(1, int(np.ceil(np.sqrt((high - low).prod() / (step**2 * samples)))))
         tile = cut_tile(camera, observation.depth, observation.planes_behind(box), region, by * step)
         if surroundings is not None:
             tile = surroundings.behind(surroundings.beneath(tile, observation.frame, box), observation.frame)
-        return View(tile, detection, (camera.width, camera.height), share, by**2)
+        return View(tile, detection, (camera.width, camera.height), z, share, by**2)
 
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
         """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
@@ -167,12 +170,12 @@ class Proposer:
         assert view.detection is not None
         box = np.array(view.detection.box)
         view = view.coarse()
-        z = centre_depth(observation.depth, box)
+        z = view.centre_depth_m
         if z == 0.0:
             return np.zeros((0, 4, 4))
         share *= _worth(shape, float(np.hypot(*box[2:])) * z / observation.frame.camera.fx)
         n = max(8, round(share * self.settings.fresh_poses))
-        drawn = self._draw(shape, box, z, observation, surroundings, rng.random((n, 6 + UNIFORMS)), rng)
+        drawn = self._draw(shape, box, z, observation, surroundings, n, rng)
         keep = max(2, round(share * self.settings.refined_poses))
         coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
@@ -247,7 +250,7 @@ class Proposer:
         z: float,
         observation: Observation,
         surroundings: Surroundings,
-        uniforms: Array,
+        n: int,
         rng: np.random.Generator,
     ) -> Array:
         """First poses (n, 4, 4): the paper's, and where there are level surfaces, half of them at rest on one.
@@ -260,10 +263,10 @@ class Proposer:
             z: depth in its middle, metres.
             observation: the keyframe.
             surroundings: with the level surfaces.
-            uniforms: (n, 6 + UNIFORMS) random numbers in [0, 1).
-            rng: draws what planes are.
+            n: how many.
+            rng: draws them.
         """
-        camera, n = observation.frame.camera, len(uniforms)
+        camera, uniforms = observation.frame.camera, rng.random((n, 6 + UNIFORMS))
         low, high = _centre_region(box, (camera.width, camera.height), shape.reach_m / z)
         pixels = low + uniforms[:, :2] * (high - low)
         rays = camera.backproject(pixels[:, 0], pixels[:, 1], np.ones(n))
@@ -300,18 +303,7 @@ class Proposer:
         return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
 
     def _distinct(self, shape: Shape, poses: Array, score: Array) -> list[int]:
-        """Rows of the best poses that differ from each other, symmetry allowed for."""
-        kept: list[int] = []
-        for row in np.argsort(-score, kind="stable"):
-            if len(kept) == self.settings.max_modes:
-                break
-            if kept:
-                r = residual(poses[kept], poses[row], shape.symmetry)
-                turned, moved = np.linalg.norm(r[:, :3], axis=-1), np.linalg.norm(r[:, 3:], axis=-1)
-                if ((turned < _SAME_ROTATION_RAD) & (moved < _SAME_TRANSLATION_M)).any():
-                    continue
-            kept.append(int(row))
-        return kept
+        return distinct(shape, poses, score, _ONE_POSE, self.settings.max_modes)
 
     def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> Array:
         """Covariances (n, 6, 6): how far the score lets a pose go along the axes of its normal equations.
@@ -369,6 +361,25 @@ class Proposer:
         scaled = hessian * unit[:, None] * unit * self.model.kappa / sensor.sigma_m**2
         scaled = scaled + np.eye(6) / _LADDER_M[-1] ** 2
         return np.linalg.inv(scaled) * unit[:, None] * unit
+
+
+def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float], most: int) -> list[int]:
+    """Rows of the best poses that differ from each other, symmetry allowed for, the best first.
+
+    Args:
+        shape: the class.
+        poses: (n, 4, 4).
+        score: (n,)
+        apart: rad and metres within which two poses are one.
+        most: so many rows at most.
+    """
+    kept: list[int] = []
+    for row in np.argsort(-score, kind="stable"):
+        if len(kept) == most:
+            break
+        if not kept or not near(poses[kept], poses[row], shape.symmetry, *apart).any():
+            kept.append(int(row))
+    return kept
 
 
 def _worth(shape: Shape, seen_m: float) -> float:

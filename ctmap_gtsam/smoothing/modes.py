@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place
-from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
+from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View, distinct
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors.mixture import log_sum
-from factors.symmetry import residual
 from sequences.geometry import Plane
 from sequences.progress import Progress
 from sequences.seeds import generator
@@ -105,13 +104,8 @@ class Found:
         """Take in poses (n, 4, 4) T_world_centre of a class that one search found, with their log-likelihoods (n,)."""
         poses = np.concatenate([self.poses[shape.index], poses])
         scores = np.concatenate([self.scores[shape.index], scores])
-        kept: list[int] = []
-        for row in np.argsort(-scores, kind="stable"):
-            r = residual(poses[kept], poses[row], shape.symmetry)
-            turned, moved = np.linalg.norm(r[:, :3], axis=-1), np.linalg.norm(r[:, 3:], axis=-1)
-            if not ((turned < _ONE_POSE[0]) & (moved < _ONE_POSE[1])).any():
-                kept.append(int(row))
-        self.poses[shape.index], self.scores[shape.index] = poses[kept[:_KEPT]], scores[kept[:_KEPT]]
+        kept = distinct(shape, poses, scores, _ONE_POSE, _KEPT)
+        self.poses[shape.index], self.scores[shape.index] = poses[kept], scores[kept]
 
     def within(self, nats: float) -> list[int]:
         """Classes that come so near to the best."""

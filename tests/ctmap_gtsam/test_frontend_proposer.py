@@ -233,6 +233,8 @@ def test_hypotheses_are_counted():
 def test_a_box_without_depth_finds_nothing():
     proposer, shape, view, observation, _ = scene("mug")
     blind = replace(observation, depth=np.zeros_like(observation.depth))
+    assert view.detection is not None
+    view = proposer.view(blind, np.array(view.detection.box), view.detection)
     assert proposer.search(shape, view, blind, NOTHING, generator(0, "test")).shape == (0, 4, 4)
 
 
