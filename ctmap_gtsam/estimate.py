@@ -28,6 +28,9 @@ Ints = NDArray[np.int64]
 
 SCHEMA = 1
 
+EXISTS = 0.5
+"""P(exists) above which an object is part of the map"""
+
 _BROKEN = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 """What NumPy and we raise on files that aren't estimates"""
 
@@ -160,9 +163,9 @@ class Estimate:
     @property
     def exists(self) -> NDArray[np.bool_]:
         """(N, K) objects that are more likely there than not, and have a pose."""
-        return (self.existence > 0.5) & (self.best_mode >= 0)
+        return (self.existence > EXISTS) & (self.best_mode >= 0)
 
-    def at(self, time_ns: int, T_world_camera: Array | None = None) -> Snapshot:
+    def at(self, time_ns: int, T_world_camera: Array | None = None, least: float = EXISTS) -> Snapshot:
         """The map at any time of the run: objects are held from the last keyframe at or before it.
 
         Args:
@@ -170,22 +173,24 @@ class Estimate:
             T_world_camera: the recorded camera pose (4, 4) at that time; where given together with the recorded pose
                 of the keyframe (`meta["recorded_T_world_camera"]`), the estimated camera is carried by the recorded
                 motion.
+            least: objects that exist with less than this probability are left out.
         """
         k = max(int(np.searchsorted(self.keyframe_time_ns, time_ns, side="right")) - 1, 0)
-        return self.at_keyframe(k, T_world_camera)
+        return self.at_keyframe(k, T_world_camera, least)
 
-    def at_keyframe(self, k: int, T_world_camera: Array | None = None) -> Snapshot:
+    def at_keyframe(self, k: int, T_world_camera: Array | None = None, least: float = EXISTS) -> Snapshot:
         """The map at keyframe k; see `at`."""
         camera = self.T_world_camera[k]
         recorded = self.meta.get("recorded_T_world_camera")
         if T_world_camera is not None and recorded is not None:
             camera = camera @ se3.inverse(np.asarray(recorded[k])) @ T_world_camera
-        rows = np.flatnonzero(self.exists[:, k])
+        rows = np.flatnonzero((self.existence[:, k] > least) & (self.best_mode[:, k] >= 0))
         best = self.class_probability[rows, k].max(axis=-1) if len(rows) else np.zeros(0)
         return Snapshot(
             keyframe=k,
             objects=rows,
             class_id=self.best_class[rows, k],
+            existence=self.existence[rows, k],
             score=self.existence[rows, k] * best,
             T_world_object=self.pose[rows, k],
             T_world_camera=camera,
@@ -218,13 +223,15 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The map at one time: n existing objects, each by its most probable class and heaviest mode."""
+    """The map at one time: n objects, each by its most probable class and heaviest mode."""
 
     keyframe: int
     objects: Ints
     """(n,) rows of Estimate.object_id"""
     class_id: Ints
     """(n,)"""
+    existence: Array
+    """(n,) P(exists)"""
     score: Array
     """(n,) P(exists) P(class)"""
     T_world_object: Array

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
 from ctmap_gtsam.shapes import Shape, build_shapes
-from factors import prediction
+from factors import mixture, prediction
 from factors.context import PairMixture, relation_table
 from factors.measurement import (
     DepthModel,
@@ -122,3 +122,28 @@ class Model:
     def class_evidence(self, summed: Array) -> Array:
         """(C,) log evidence of the true class c from class_scores (C,) summed over a track and visit: saturating."""
         return persistent_class_log_evidence(summed, self.log_confusion)
+
+    def existence(
+        self, log_evidence: Array, score_evidence: Array, log_clutter: float, *log_rivals: float
+    ) -> tuple[float, Array]:
+        """P(a track is a known thing), and its class.
+
+        That no pose explains more than clutter would may be the search's fault: a part of such tracks are known things
+        all the same (`detector.unfound`), of the class that the scores say.
+
+        Args:
+            log_evidence: (C,) of each class at the poses that were found, scores and context included; -inf for none.
+            score_evidence: (C,) the scores' part of it; -inf for classes that have no pose.
+            log_clutter: log evidence of something that no mesh explains.
+            log_rivals: of what else it may be.
+
+        Returns:
+            P(exists) and P(class | exists) (C,).
+        """
+        found = mixture.log_sum(log_evidence)
+        p_found, p_clutter, *_ = np.exp(mixture.normalised(np.array([found, log_clutter, *log_rivals])))
+        by_pose, by_scores = np.exp(mixture.normalised(log_evidence)), np.exp(mixture.normalised(score_evidence))
+        unfound = self.config.detector.unfound if np.isfinite(score_evidence).any() else 0.0
+        each = p_found * by_pose + unfound * p_clutter * by_scores
+        total = float(each.sum())
+        return total, each / total if total > 0.0 else by_pose

@@ -42,6 +42,12 @@ class Detector:
     box_sigma: float = option(0.05, "scale of a box edge's error, as a share of the box's size", low=0.005)
     box_outlier: float = option(0.02, "share of boxes that have nothing to do with the object", low=1e-6, high=0.5)
     clutter_rate: float = option(0.3, "chance that clutter is detected again where it was", low=0.01, high=0.99)
+    unfound: float = option(
+        0.4,
+        "chance that a track of which no pose explains more than clutter is a known thing all the same",
+        low=0.0,
+        high=0.9,
+    )
     confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
     score_floor: float = option(0.05, "weight of a uniform belief mixed into score vectors", low=1e-6, high=0.9)
 
@@ -71,6 +77,9 @@ class Context:
     support_sigma_m: float = option(0.01, "how far beyond that a thing may seem to float, metres", low=1e-4)
     other_support: float = option(0.02, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)
     penetration_sigma_m: float = option(0.003, "how deep a thing may seem to sink into another, metres", low=1e-4)
+    doubt: float = option(
+        1e-6, "chance that a neighbour or a surface isn't where it is believed to be", low=1e-300, high=0.5
+    )
 
 
 @dataclass(frozen=True)

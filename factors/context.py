@@ -198,6 +198,15 @@ def hinge_log_potential(excess_m: ArrayLike, sigma_m: ArrayLike) -> Array:
     return -0.5 * hinge_residual(excess_m, sigma_m)[0] ** 2
 
 
+def doubted(log_potential: ArrayLike, doubt: float) -> Array:
+    """The log of (1 - doubt) exp(log_potential) + doubt (...): a potential whose premise may be false, nats.
+
+    A neighbour is a point estimate of the keyframe before, and a surface is a plane that was fitted: either may not be
+    there. What contradicts them is then charged log(doubt) at most.
+    """
+    return np.logaddexp(np.log1p(-doubt) + np.asarray(log_potential, dtype=np.float64), np.log(doubt))
+
+
 def per_keyframe(log_ratio: ArrayLike, keyframes: ArrayLike) -> Array:
     """The share log_ratio / n of each of the n keyframes over which a pair stands; a residual's is e / sqrt(n)."""
     return np.asarray(log_ratio, dtype=np.float64) / np.asarray(keyframes, dtype=np.float64)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ctmap_gtsam.estimate import Estimate, Snapshot
+from ctmap_gtsam.estimate import EXISTS, Estimate, Snapshot
 from ctmap_gtsam.evaluation.pose import Shape
 from sequences import se3
 from sequences.catalogue import Catalogue
@@ -83,9 +83,9 @@ def shapes_of(catalogue: Catalogue) -> dict[int, Shape]:
     return {c.obj_id: Shape(c) for c in catalogue.classes}
 
 
-def snapshots(frames: Sequence[Frame], estimate: Estimate) -> list[Snapshot]:
-    """The map at every frame: held between keyframes, the camera carried by the recorded motion."""
-    return [estimate.at(frame.time_ns, frame.T_world_camera) for frame in frames]
+def snapshots(frames: Sequence[Frame], estimate: Estimate, least: float = EXISTS) -> list[Snapshot]:
+    """The map at every frame: held between keyframes, the camera carried by the recorded motion (see `Estimate.at`)."""
+    return [estimate.at(frame.time_ns, frame.T_world_camera, least) for frame in frames]
 
 
 def from_truth(run: Run, truth: Truth) -> ObjectFrames:

@@ -36,7 +36,7 @@ from ctmap_gtsam.evaluation.identity import identity_switches
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, from_estimate, from_truth, match, shapes_of
 from ctmap_gtsam.evaluation.moves import Periods
 from ctmap_gtsam.evaluation.trajectory import CameraErrors
-from ctmap_gtsam.evaluation.views import final_views, views
+from ctmap_gtsam.evaluation.views import DOUBTFUL, final_views, views
 from ctmap_gtsam.evaluation.visits import LastSeen, MapEnds
 from ctmap_gtsam.evaluation.vsd import Scene, scenes
 from sequences.atomic import write_npz
@@ -182,8 +182,8 @@ class Judge:
         case = self.run, method, self.objects, matching
         errors = frames.frame_errors(*case, self.shapes, self.scenes)
         obj_ids = self.run.catalogue.obj_ids
-        own = [view.boxes() for view in views(self.run, method.estimate, self._step)]
-        final = [view.boxes() for view in final_views(self.run, method.estimate, self._step)]
+        own = [view.boxes() for view in views(self.run, method.estimate, self._step, DOUBTFUL)]
+        final = [view.boxes() for view in final_views(self.run, method.estimate, self._step, DOUBTFUL)]
         record = self._record(
             method.name,
             posed=True,

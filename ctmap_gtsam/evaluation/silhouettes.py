@@ -43,16 +43,20 @@ def silhouettes(
     T_camera_object: Array,
     camera: Camera,
     step: int = 1,
+    hides: Bools | None = None,
 ) -> list[Silhouette]:
     """Draw n objects of a map, obj_ids (n,) at poses (n, 4, 4), into one camera. Only they hide each other.
+
+    Where `hides` (n,) is given, only those of them do.
 
     With a step, every `step`-th pixel each way stands for its neighbours: boxes are then good to `step` pixels.
     """
     coarse = camera.window(0, 0, -(-camera.width // step), -(-camera.height // step), step)
     drawn = [draw(catalogue[int(c)].mesh, T, coarse) for c, T in zip(class_id, T_camera_object, strict=True)]
     nearest = np.full((coarse.height, coarse.width), np.inf, dtype=np.float32)
-    for window, depth in drawn:
-        np.minimum(nearest[window], depth, out=nearest[window])
+    for k, (window, depth) in enumerate(drawn):
+        if hides is None or hides[k]:
+            np.minimum(nearest[window], depth, out=nearest[window])
     return [_silhouette(window, depth, nearest, camera, step) for window, depth in drawn]
 
 

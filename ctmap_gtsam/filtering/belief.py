@@ -18,6 +18,7 @@ from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import mixture, symmetry
+from factors.measurement import box_iou
 from factors.mixture import log_sum
 from factors.persistence import stay_probability
 from sequences import se3
@@ -243,36 +244,36 @@ class Updater:
     def report(self, belief: Belief, around: Surroundings) -> Reported:
         """The posterior, the context multiplied in once."""
         log_evidence = belief.class_log_evidence(self.model)
-        weighted: list[tuple[ClassBelief, Array] | None] = []
+        weighted: list[Particles | None] = []
         context = np.zeros(len(self.model.shapes))
         for c, own in enumerate(belief.classes):
             if own is None or log_evidence[c] < log_evidence.max() - 3.0 * _LIKELY:
-                weighted.append(None)
+                weighted.append(None if own is None else own.particles)
                 context[c] = -np.inf  # too far behind to be looked at: its context can't make it the best
                 continue
             nats = around.log_potential(self.model, self.model.shapes[c], own.particles.T_world_centre)
             joint = own.particles.log_weight + nats
             context[c] = float(log_sum(joint))
-            weighted.append((own, mixture.normalised(joint)))
-        probability = np.exp(mixture.normalised(log_evidence + context))
+            weighted.append(Particles(own.particles.T_world_centre, mixture.normalised(joint)))
         # a solid thing can't be where another or a surface is: context decides on existence, too
         there = float(log_sum(log_evidence + context))
-        rivals = np.logaddexp(np.logaddexp(belief.log_clutter, 0.0), belief.log_elsewhere)
-        existence = 1.0 / (1.0 + np.exp(np.clip(rivals - there, -700.0, 700.0)))
+        scores = belief.score_evidence + self.model.class_evidence(belief.score_sum)
+        posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
+        rivals = (belief.log_clutter, 0.0, belief.log_elsewhere)
+        existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
         modes: list[tuple[int, float, Array, Array, Array]] = []
-        for c, entry in enumerate(weighted):
-            if entry is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
-                own, log_weight = entry
-                modes += _modes(c, Particles(own.particles.T_world_centre, log_weight), self.model.shapes[c])
+        for c, particles in enumerate(weighted):
+            if particles is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
+                modes += _modes(c, particles, self.model.shapes[c])
         best = int(np.argmax(probability))
         chosen = belief.classes[best]
         ledger = {
             "depth": 0.0 if chosen is None else chosen.log_evidence,
-            "class": float((belief.score_evidence + self.model.class_evidence(belief.score_sum))[best]),
-            "context": float(context[best]),
+            "class": float(scores[best]),
+            "context": float(context[best]) if np.isfinite(context[best]) else 0.0,
         }
         elsewhere = float(np.exp(belief.log_elsewhere - np.logaddexp(there, belief.log_elsewhere)))
-        return Reported(probability, there, float(existence), elsewhere, belief.visible, tuple(modes), ledger)
+        return Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), ledger)
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
@@ -288,8 +289,15 @@ class Updater:
 
     def _where(self, belief: Belief, detection: Detection | None, observation: Observation) -> Array | None:
         """The box to look in: the detection's, or where the most probable class would appear; None out of view."""
-        if detection is not None:
-            return np.array(detection.box)
+        return self._outline(belief, observation) if detection is None else np.array(detection.box)
+
+    def covers(self, belief: Belief, detection: Detection, observation: Observation) -> bool:
+        """Whether a box overlaps at all with where the object would appear."""
+        outline = self._outline(belief, observation)
+        return outline is not None and float(box_iou(outline, np.array(detection.box))) > 0.0
+
+    def _outline(self, belief: Belief, observation: Observation) -> Array | None:
+        """The box (x, y, w, h) of the most probable class at its heaviest pose; None out of view."""
         best = int(np.argmax(belief.class_log_evidence(self.model)))
         own = belief.classes[best]
         if own is None:
@@ -476,6 +484,8 @@ class Updater:
             # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
             seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
             log_prior = np.where(seen, log_drawn, stayed)
+            # the prediction's tails end somewhere, or thousands of nats of depth buy any distance
+            log_prior = np.where(self._nearby(own.particles, T), log_prior, -np.inf)
         log_q = log_drawn
         if proposals is not None:
             # the prior is part of the mixture, so no weight exceeds the likelihood by more than 1 / (1 - share)
@@ -485,6 +495,11 @@ class Updater:
         gained = float(log_sum(log_weight)) - np.log(len(T))
         before = 0.0 if own is None else own.log_evidence
         return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained)
+
+    def _nearby(self, particles: Particles, T_world_centre: Array) -> NDArray[np.bool_]:
+        """Which poses (K, 4, 4) a push can bring about; a box farther away is another thing's."""
+        away = np.linalg.norm(T_world_centre[:, :3, 3] - particles.best(1)[0, :3, 3], axis=-1)
+        return np.asarray(away < self.model.config.prediction.region_radius_m)
 
     def _in_world(self, modes: PoseModes, observation: Observation) -> Gaussians | None:
         """The modes as proposals in the world frame; None where there are none."""

@@ -87,7 +87,7 @@ class _State:
         surroundings = self._surroundings(before)
         tracks = self.associator.tracks()
         reported: dict[int, Reported] = {}
-        for i, detection in self._detections(tracks, observation.keyframe).items():
+        for i, detection in self._detections(tracks, observation).items():
             around = surroundings.without(i)
             belief = self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
             # what nobody sees is believed to be as it was
@@ -98,12 +98,18 @@ class _State:
             self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
         self.reports.append(self._find_moved(self._merge(reported)))
 
-    def _detections(self, tracks: tuple[Track, ...], keyframe: int) -> dict[int, Detection | None]:
-        """Every object's detection, the surest where several of its tracks have one."""
+    def _detections(self, tracks: tuple[Track, ...], observation: Observation) -> dict[int, Detection | None]:
+        """Every object's detection, the surest where several of its tracks have one.
+
+        A track that was taken for an object known before, and whose box has nothing to do with it any more, is let go.
+        """
         out: dict[int, Detection | None] = dict.fromkeys(sorted(self.beliefs))
         for track in tracks:
-            i, detection = self.owner.get(track.track_id), track.at(keyframe)
+            i, detection = self.owner.get(track.track_id), track.at(observation.keyframe)
             if i is None or detection is None:
+                continue
+            if i != track.track_id and not self.updater.covers(self.beliefs[i], detection, observation):
+                del self.owner[track.track_id]
                 continue
             other = out[i]
             if other is None or detection.class_scores[1:].max() > other.class_scores[1:].max():

@@ -228,16 +228,21 @@ class Proposer:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
 
         A surface of unknown form explains a share of what the right mesh would, where the background doesn't explain
-        the depth already; its boxes come less often, and fit as well.
+        the depth already; its boxes come less often, and fit as well. It has gone where most of the silhouette is seen
+        through.
         """
-        detector = self.model.config.detector
-        if view.detection is None:
-            return view.share * float(np.log1p(-detector.clutter_rate))
+        detector, sensor = self.model.config.detector, self.model.config.sensor
         rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
-        z, background, sensor = view.tile.depth, view.tile.background, self.model.config.sensor
-        seen = (rendered > 0) & (z > rendered - sensor.occlusion_margin_m)
+        z, background = view.tile.depth, view.tile.background
+        measured = (rendered > 0) & (z > 0)
+        seen = measured & (z > rendered - sensor.occlusion_margin_m)
+        sample = view.samples * self.model.kappa * sensor.clutter_gain
+        if view.detection is None:
+            through = measured & (z > rendered + sensor.occlusion_margin_m)
+            empty = float(max(2 * int(through.sum()) - int(measured.sum()), 0))
+            return view.share * (float(np.log1p(-detector.clutter_rate)) - sample * empty)
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        gain = view.samples * self.model.kappa * sensor.clutter_gain * float((seen & surprising & (z > 0)).sum())
+        gain = sample * float((seen & surprising).sum())
         box = np.array(view.detection.box)
         # its boxes jitter, too, about one that nobody knows: a nat is what an edge of Laplace's density expects to lose
         matched = float(self.model.box(box, box[None], view.image_size)[0]) - _EDGES

@@ -11,7 +11,7 @@ from ctmap_gtsam.frontend.observation import reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from factors.context import context_log_ratio, hinge_log_potential
+from factors.context import context_log_ratio, doubted, hinge_log_potential
 from sequences import se3
 from sequences.geometry import Plane, plane_depth
 from sequences.rendering.scene import render_scene
@@ -97,15 +97,16 @@ class Surroundings:
         return total
 
     def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
-        deepest = np.zeros(len(T))
+        settings = model.config.context
+        total = np.zeros(len(T))
         for other in self.neighbours:
             apart = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
             near = np.flatnonzero(apart < shape.reach_m + other.shape.reach_m)
             if len(near):
                 depth = penetration_depth(shape, other.shape, se3.inverse(T[near]) @ other.T_world_centre)
-                deepest[near] = np.maximum(deepest[near], depth)
-        tolerance = model.config.context.support_tolerance_m
-        return hinge_log_potential(deepest - tolerance, model.config.context.penetration_sigma_m)
+                sinking = hinge_log_potential(depth - settings.support_tolerance_m, settings.penetration_sigma_m)
+                total[near] += doubted(sinking, settings.doubt)
+        return total
 
 
 def penetration_depth(a: Shape, b: Shape, T_a_b: Array) -> Array:
@@ -135,7 +136,7 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
         low, high = heights.min(axis=-1), heights.max(axis=-1)
         floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
         sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
-        potential = np.logaddexp(floating, np.log(settings.other_support)) + sinking
+        potential = np.logaddexp(floating, np.log(settings.other_support)) + doubted(sinking, settings.doubt)
         concerned = above & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
         best = np.where(concerned, np.maximum(best, potential), best)
     return np.where(np.isneginf(best), 0.0, best)

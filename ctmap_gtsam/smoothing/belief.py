@@ -14,7 +14,6 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage, solve
 from ctmap_gtsam.smoothing.graph import Measured
 from ctmap_gtsam.smoothing.modes import Recording, Sighting, in_world
-from factors import mixture
 from factors.mixture import log_sum
 
 Array = NDArray[np.float64]
@@ -43,31 +42,35 @@ class Thing:
     """(C,) depth, boxes, context, scores and prior"""
     score_evidence: Array
     """(C,) the scores' part of it"""
-    log_clutter: float
-    """log evidence of something that no mesh explains, at the same keyframes"""
+    posterior: tuple[float, Array]
+    """P(a known mesh rather than clutter or nothing) and the classes' probabilities (C,), see `Model.existence`"""
     poses: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
     """keyframe -> smoothed T_world_centre (4, 4) and covariance (6, 6) of the best class"""
 
-    @cached_property
+    @property
     def class_probability(self) -> Array:
         """(C,) posterior of the classes."""
-        return np.exp(mixture.normalised(self.class_log_evidence))
+        return self.posterior[1]
 
     @property
     def best_class(self) -> int:
-        """Index in the catalogue."""
+        """Index in the catalogue, of the class whose poses explain most."""
         return int(np.argmax(self.class_log_evidence))
+
+    @property
+    def reported_class(self) -> int:
+        """Index in the catalogue; of what no pose explains, the detector's word decides."""
+        return int(np.argmax(self.class_probability))
 
     @property
     def log_evidence(self) -> float:
         """Of all classes together, against nothing."""
         return float(log_sum(self.class_log_evidence))
 
-    @cached_property
+    @property
     def solid(self) -> float:
         """P(a known mesh rather than clutter or nothing)."""
-        odds = self.log_evidence - float(np.logaddexp(self.log_clutter, 0.0))
-        return float(1.0 / (1.0 + np.exp(-np.clip(odds, -700.0, 700.0))))
+        return self.posterior[0]
 
     @property
     def exists(self) -> bool:
@@ -81,8 +84,8 @@ class Thing:
 
     @cached_property
     def presence(self) -> Array:
-        """P(present | it exists) at each of `keyframes`, for the best class."""
-        posterior = self.posteriors.get(self.best_class)
+        """P(present | it exists) at each of `keyframes`, for the reported class."""
+        posterior = self.posteriors.get(self.reported_class)
         if posterior is None:
             return np.zeros(len(self.keyframes))
         return np.clip([1.0 - m[-1] for m in posterior.modes], 0.0, 1.0)
@@ -109,6 +112,11 @@ class Thing:
         """(1, 4, 4) best guess of class c at a keyframe: smoothed, or the trellis's nearest mode."""
         if c == self.best_class and self.poses:
             return self.poses[_nearest(sorted(self.poses), keyframe)][0][None]
+        near = self._mode_near(c, keyframe)
+        return None if near is None else near[0][None]
+
+    def _mode_near(self, c: int, keyframe: int) -> tuple[Array, Array] | None:
+        """Pose (4, 4) and covariance (6, 6) of the mode of class c that the best path goes through nearest in time."""
         stages = self.stages.get(c)
         if stages is None:
             return None
@@ -117,7 +125,7 @@ class Thing:
         if not there:
             return None
         i = min(there, key=lambda i: (abs(stages[i].keyframe - keyframe), i))
-        return stages[i].T_world_centre[path[i]][None]
+        return stages[i].T_world_centre[path[i]], stages[i].covariance[path[i]]
 
     def presence_at(self, keyframe: int) -> float:
         """P(present | it exists) at any keyframe: that of the last one in view, or of the first before that."""
@@ -159,9 +167,12 @@ class Thing:
         return out
 
     def held(self, keyframe: int) -> tuple[Array, Array] | None:
-        """Smoothed pose and covariance at the nearest measured keyframe, the past first; None where it has none."""
-        if not self.poses:
-            return None
+        """Pose and covariance in the reported class at a keyframe; None where it has none.
+
+        Smoothed at the nearest measured keyframe, the past first; what more likely doesn't exist isn't smoothed.
+        """
+        if self.reported_class != self.best_class or not self.poses:
+            return self._mode_near(self.reported_class, keyframe)
         keyframes = sorted(self.poses)
         before = [k for k in keyframes if k <= keyframe]
         return self.poses[before[-1] if before else keyframes[0]]
@@ -171,7 +182,7 @@ class Thing:
         if keyframe not in self.sightings:
             return 0.0
         i = self.keyframes.index(keyframe)
-        posterior = self.posteriors[self.best_class]
+        posterior = self.posteriors[self.reported_class]
         marginal, state = posterior.modes[i], posterior.path[i]
         if state == len(marginal) - 1:
             return 0.0
@@ -207,16 +218,10 @@ def judge(
         evidence[c] = posteriors[c].log_evidence
     scores = _score_evidence(tracks, recording, model)
     clutter = float(sum(s.log_clutter for s in sightings.values()))
-    return Thing(
-        object_id,
-        tracks,
-        sightings,
-        stages,
-        posteriors,
-        evidence + scores - np.log(len(model.shapes)),
-        scores,
-        clutter,
-    )
+    log_evidence = evidence + scores - np.log(len(model.shapes))
+    posed = np.where(np.isfinite(evidence), scores, -np.inf)
+    posterior = model.existence(log_evidence, posed, clutter, 0.0)
+    return Thing(object_id, tracks, sightings, stages, posteriors, log_evidence, scores, posterior)
 
 
 def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:

@@ -25,7 +25,7 @@ def write(
     recording: Recording, model: Model, things: Mapping[int, Thing], smoothed: Smoothed, diagnostics: dict[str, object]
 ) -> Estimate:
     """Every object at every keyframe: smoothed where measured, held between."""
-    kept = [thing for _, thing in sorted(things.items()) if thing.best_class in thing.posteriors]
+    kept = [thing for _, thing in sorted(things.items()) if thing.reported_class in thing.posteriors]
     tables = Tables(len(kept), len(recording.keyframes), len(model.catalogue))
     for row, thing in enumerate(kept):
         _write_thing(tables, row, thing, recording, model, smoothed)
@@ -47,7 +47,7 @@ def write(
 def _write_thing(
     tables: Tables, row: int, thing: Thing, recording: Recording, model: Model, smoothed: Smoothed
 ) -> None:
-    shape = model.shapes[thing.best_class]
+    shape = model.shapes[thing.reported_class]
     free = shape.symmetry.free_axes
     for k in range(len(recording.keyframes)):
         tables.class_probability[row, k] = thing.class_probability
@@ -73,7 +73,7 @@ def _write_thing(
 
 
 def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
-    """Other modes of the best class, and modes of other classes that are still possible, as the trellis weighs them."""
+    """Other modes of the reported class, and of other classes that are still possible, as the trellis weighs them."""
     for c, posterior in thing.posteriors.items():
         if thing.class_probability[c] < _REPORTED or k not in thing.sightings:
             continue
@@ -83,7 +83,7 @@ def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: M
         shape = model.shapes[c]
         for state in range(len(stage.log_evidence)):
             share = marginal[state] / present
-            if share < _REPORTED or (c == thing.best_class and state == posterior.path[i]):
+            if share < _REPORTED or (c == thing.reported_class and state == posterior.path[i]):
                 continue
             tables.mode(
                 row,
@@ -98,7 +98,7 @@ def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: M
 
 def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
     """What each potential says at the mode that the best path goes through; the score vectors' word on the class."""
-    c = thing.best_class
+    c = thing.reported_class
     for k, stage, state in zip(thing.keyframes, thing.stages[c], thing.posteriors[c].path, strict=True):
         modes = thing.sightings[k].modes[c]
         if modes is None or state == len(stage.log_evidence):
@@ -113,7 +113,7 @@ def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
 
 def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float) -> None:
     """A line for every gap between views that is long enough to hold a move, or that probably held one."""
-    posterior = thing.posteriors.get(thing.best_class)
+    posterior = thing.posteriors.get(thing.reported_class)
     if posterior is None:
         return
     frames = recording.run.frames

@@ -196,6 +196,21 @@ def test_final_views_use_the_cameras_of_each_frame(small):
         np.testing.assert_allclose(own.T_camera_object, final.T_camera_object, atol=1e-12)
 
 
+def test_what_may_not_be_there_counts_by_its_score_and_hides_nothing(small):
+    """A doubtful object stands among the detections, ranked low; what is behind it keeps its box."""
+    run, truth = small
+    sure = synthetic.estimate_of(run, truth)
+    doubtful = synthetic.estimate_of(run, truth, existence=lambda n, f: 0.3 if n == 1 else 1.0)
+    alone = synthetic.estimate_of(run, truth, existence=lambda n, f: 0.0 if n == 1 else 1.0)
+    assert pooled([record(run, truth, "doubtful", doubtful)])["map_50"] == pytest.approx(
+        pooled([record(run, truth, "sure", sure)])["map_50"]
+    )
+    for with_it, without in zip(views(run, doubtful, least=0.05), views(run, alone, least=0.05), strict=True):
+        boxes = [b for b in with_it.boxes() if b[1] > 0.5]
+        assert boxes == without.boxes()
+    assert all(len(view.objects) < 3 for view in views(run, doubtful))
+
+
 def test_a_coarse_silhouette_has_nearly_the_same_box(small):
     """Within a step on each side, and on the whole neither larger nor to one side."""
     run, truth = small

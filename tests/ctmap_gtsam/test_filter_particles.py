@@ -246,3 +246,19 @@ def test_a_thing_that_jumped_is_found_as_likely_as_the_prior_says(jump):
     gained = after.classes[0].log_evidence - start.classes[0].log_evidence
     assert gained == pytest.approx(np.log(jump) + model.log_uniform(model.shapes[0]), abs=0.3)
     assert after.classes[0].particles.best(1)[0, 0, 3] == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("jump", [1e-12, 0.01])
+def test_no_measurement_takes_a_thing_farther_than_it_can_be_pushed(jump):
+    """A box a metre away, with all the depth in the world, is another thing's."""
+    model = Model(classes("mug"), config_of(f"prediction.jump_probability={jump}"), context=False)
+    far = se3.make(np.eye(3), REFERENCE[:3, 3] + [1.0, 0.0, 0.0])
+    covariance = {k: np.diag(SCALE**2) for k in (0, 1)}
+    # localisation so bad that the prediction's Gaussian would reach there at a price that depth pays
+    updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise(0.0, 0.1))
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    start = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection))
+    after = updater.step(start, detection, observation_at(1, detection), Surroundings((), ()))
+    away = after.classes[0].particles.T_world_centre[:, 0, 3]
+    weights = np.exp(after.classes[0].particles.log_weight)
+    assert weights[np.abs(away) > model.config.prediction.region_radius_m].sum() < 1e-12

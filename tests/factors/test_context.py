@@ -120,3 +120,11 @@ def test_hinges_cost_only_what_is_too_much(excess, sigma):
 def test_a_pair_counts_once_however_many_keyframes_it_stands(log_ratio, keyframes):
     shares = np.full(keyframes, context.per_keyframe(log_ratio, keyframes))
     assert shares.sum() == pytest.approx(log_ratio, abs=1e-9)
+
+
+@given(st.floats(-1e5, 50.0), st.floats(1e-9, 0.5))
+def test_what_contradicts_a_doubtful_premise_is_charged_the_doubt_at_most(log_potential, doubt):
+    said = context.doubted(log_potential, doubt)
+    assert said >= np.log(doubt) - 1e-9
+    assert said == pytest.approx(np.log((1.0 - doubt) * np.exp(log_potential) + doubt), abs=1e-9)
+    assert context.doubted(0.0, doubt) == pytest.approx(0.0, abs=1e-9)  # nor does doubt cost what fits

@@ -1,0 +1,54 @@
+"""Laws of existence: what a track is believed to be, beside what no mesh explains."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.ctmap_gtsam.scenes import model_of
+
+MODEL = model_of("mug", "soup_can", "cereal_box")
+UNFOUND = MODEL.config.detector.unfound
+nats = st.floats(-500.0, 500.0)
+three = st.lists(nats, min_size=3, max_size=3).map(np.array)
+
+
+@given(three, three, nats, nats)
+def test_existence_and_classes_are_probabilities(evidence, scores, clutter, rival):
+    exists, classes = MODEL.existence(evidence, scores, clutter, rival)
+    assert 0.0 <= exists <= 1.0 + 1e-12
+    assert classes.sum() == pytest.approx(1.0)
+    assert (classes >= 0.0).all()
+
+
+@given(three, three, nats, nats, st.permutations(range(3)))
+def test_classes_have_no_order(evidence, scores, clutter, rival, order):
+    exists, classes = MODEL.existence(evidence, scores, clutter, rival)
+    again, permuted = MODEL.existence(evidence[order], scores[order], clutter, rival)
+    assert again == pytest.approx(exists)
+    np.testing.assert_allclose(permuted, classes[order], atol=1e-9)
+
+
+@given(three, nats)
+def test_what_poses_explain_well_exists_whatever_the_scores_say(scores, clutter):
+    evidence = clutter + np.array([0.0, 60.0, 20.0])
+    exists, classes = MODEL.existence(evidence, scores, clutter, clutter)
+    assert exists == pytest.approx(1.0)
+    assert np.argmax(classes) == 1
+
+
+@given(three)
+def test_what_no_pose_explains_may_still_be_what_the_detector_says(evidence):
+    scores = np.array([1.0, 3.0, -2.0])
+    exists, classes = MODEL.existence(evidence, scores, evidence.max() + 60.0, 0.0)
+    assert exists == pytest.approx(UNFOUND, abs=1e-9) or evidence.max() + 60.0 < 30.0
+    np.testing.assert_allclose(classes, np.exp(scores) / np.exp(scores).sum(), atol=1e-6)
+
+
+def test_where_nothing_is_nothing_exists_and_without_poses_neither():
+    exists, _ = MODEL.existence(np.full(3, -80.0), np.zeros(3), -50.0, 0.0)
+    assert exists < 1e-12
+    nowhere = np.full(3, -np.inf)
+    exists, classes = MODEL.existence(nowhere, nowhere, 50.0, 0.0)
+    assert exists == 0.0
+    assert classes.sum() == pytest.approx(1.0)
