@@ -62,8 +62,12 @@ class Model:
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
 
     def prediction_covariance(self, dt_s: float) -> Array:
-        """Sigma = Q dt (6, 6) in the centre frame's tangent."""
+        """Sigma = Q dt (6, 6) in the centre frame's tangent.
+
+        What stays doesn't wander on while nobody looks: dt counts up to the significant period.
+        """
         p = self.config.prediction
+        dt_s = min(dt_s, p.significant_period_s)
         return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
 
     def log_uniform(self, shape: Shape) -> float:

@@ -435,20 +435,14 @@ class Updater:
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
-        settings, noise = self.model.config.prediction, self.localisation
+        noise = self.localisation
         dt = max((observation.frame.time_ns - before_ns) * 1e-9, 1e-3)
+        walked = np.diag(self.model.prediction_covariance(dt))
         # two recorded poses that lie closer than the correlation time err together
         apart = 2.0 * (1.0 - np.exp(-dt / max(noise.correlation_time_s, 1e-9)))
         away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
-        return Spread(
-            float(np.sqrt(settings.rotation_rate**2 * dt + apart * noise.rotation_rad**2)),
-            float(
-                np.sqrt(
-                    settings.translation_rate**2 * dt
-                    + apart * (noise.translation_m**2 + (away * noise.rotation_rad) ** 2)
-                )
-            ),
-        )
+        seems_off = apart * (noise.translation_m**2 + (away * noise.rotation_rad) ** 2)
+        return Spread(float(np.sqrt(walked[0] + apart * noise.rotation_rad**2)), float(np.sqrt(walked[3] + seems_off)))
 
     def _weigh(
         self,

@@ -129,8 +129,7 @@ class _Between:
         unseen = dt > settings.significant_period_s and shape.source.movable
         r1 = settings.stay_limit
         stay = float(stay_probability(dt, shape.source.persistence_s, r1, 1.0 - r1)) if unseen else 1.0
-        # an object that stays doesn't wander on while nobody looks
-        sigma = model.prediction_covariance(min(dt, settings.significant_period_s)) + np.diag(noise_variance)
+        sigma = model.prediction_covariance(dt) + np.diag(noise_variance)
         return cls(min(stay, 1.0 - settings.jump_probability), sigma)
 
 

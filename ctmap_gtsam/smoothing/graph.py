@@ -211,8 +211,7 @@ def _add_object(
         if S.free:
             built.add("gauge", gauge_factor(f"gauge of {name}", key, reference, S))
         if before is not None and m.stays:
-            dt = max(min(m.time_s - before.time_s, model.config.prediction.significant_period_s), 1e-3)
-            sigma = model.prediction_covariance(dt)
+            sigma = model.prediction_covariance(max(m.time_s - before.time_s, 1e-3))
             previous = object_key(row, before.keyframe)
             built.add("prediction", prediction_factor(f"prediction of {name}", previous, key, sigma, S))
         before = m
