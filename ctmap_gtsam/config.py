@@ -13,6 +13,7 @@ from ctmap_gtsam.parameters import (
     Filter,
     Frontend,
     Keyframes,
+    Paper,
     Prediction,
     Sensor,
     Smoother,
@@ -34,6 +35,7 @@ class Config:
     context: Context = field(default_factory=Context)
     frontend: Frontend = field(default_factory=Frontend)
     filter: Filter = field(default_factory=Filter)
+    paper: Paper = field(default_factory=Paper)
     smoother: Smoother = field(default_factory=Smoother)
     baselines: Baselines = field(default_factory=Baselines)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)

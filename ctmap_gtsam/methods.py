@@ -14,6 +14,7 @@ from ctmap_gtsam.baselines.fusion import static_fusion
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
+from ctmap_gtsam.filtering.literal import literal_filter_run
 from ctmap_gtsam.smoothing.smoother import smooth_run
 from sequences.progress import Progress
 from sequences.types import Run
@@ -57,6 +58,10 @@ def _filter(run: Run, config: Config, progress: Progress, *, context: bool) -> E
     return filter_run(run, config, context=context, progress=progress)
 
 
+def _literal(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
+    return literal_filter_run(run, config, context=context, progress=progress)
+
+
 def _smooth(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
     return smooth_run(run, config, context=context, progress=progress)
 
@@ -75,6 +80,10 @@ METHODS: dict[str, Method] = {
                "estimate", partial(oracle.register_truth, kind="fpfh"), _needs_truth, reads_truth=True),
         Method("static-fusion", "one pose an object and visit, fused from all keyframes: nothing moves, no context",
                "estimate", static_fusion, _needs_detections),
+        Method("paper-t", "T-Map to the letter of the paper", "estimate",
+               partial(_literal, context=False), _needs_detections),
+        Method("paper-ct", "CT-Map to the letter of the paper: Algorithm 1 with its own potentials", "estimate",
+               partial(_literal, context=True), _needs_detections),
         Method("filter-t", "T-Map: the particle filter without context", "estimate",
                partial(_filter, context=False), _needs_detections),
         Method("filter-ct", "CT-Map: the particle filter, each frame seeing the past", "estimate",

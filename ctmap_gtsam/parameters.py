@@ -115,6 +115,19 @@ class Filter:
 
 
 @dataclass(frozen=True)
+class Paper:
+    """The paper's filter to the letter, `--paper`: constants that it names but doesn't give."""
+
+    particles: int = option(2000, "M, particles an object", low=10)
+    rotation_sigma_rad: float = option(
+        0.05, "root of Sigma in Equation 2, about each axis and a keyframe, rad", low=1e-6
+    )
+    translation_sigma_m: float = option(0.01, "the same in each direction, metres", low=1e-6)
+    lambda_per_m2: float = option(50.0, "lambda of Equation 6, by the sum over samples of squared metres", low=0.0)
+    delta: float = option(1e-3, "phi_m of what is out of view", low=1e-300)
+
+
+@dataclass(frozen=True)
 class Smoother:
     """The factor graph and its rounds."""
 

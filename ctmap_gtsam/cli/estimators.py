@@ -14,22 +14,27 @@ if TYPE_CHECKING:
     from ctmap_gtsam.config import Config
 
 NoContext = Annotated[bool, typer.Option("--no-context", help="Leave the context between objects out.")]
+Literal = Annotated[bool, typer.Option("--paper", help="Algorithm 1 and the potentials to the letter of the paper.")]
 
 
 def filter(
     run: RunFolder,
     out: Out,
     no_context: NoContext = False,
+    paper: Literal = False,
     scene: Scene = None,
     config_file: ConfigFile = None,
     assignments: Assignments = None,
     seed: Seed = None,
 ) -> None:
-    """Filter a run: each frame's map knows the past alone. Writes DIR/filter-ct.npz (filter-t without context).
+    """Filter a run: each frame's map knows the past alone.
+
+    Writes DIR/filter-ct.npz (filter-t without context, paper-ct and paper-t with --paper).
 
     Example: `ctmap filter recordings/kitchen --out results --set keyframes.every=2`
     """
-    _estimate("filter-t" if no_context else "filter-ct", run, scene, out, settings(config_file, assignments, seed))
+    method = f"{'paper' if paper else 'filter'}-{'t' if no_context else 'ct'}"
+    _estimate(method, run, scene, out, settings(config_file, assignments, seed))
 
 
 def smooth(

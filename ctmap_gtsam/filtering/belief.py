@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.building import Tables
 from ctmap_gtsam.filtering.memory import Memory
-from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
+from ctmap_gtsam.filtering.particles import (
+    MODE_RADIUS,
+    Gaussians,
+    Particles,
+    Spread,
+    modes_of,
+    predict,
+    predicted_log_density,
+)
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.observation import Observation
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
@@ -21,7 +29,6 @@ from factors import mixture, symmetry
 from factors.measurement import box_iou
 from factors.mixture import log_sum
 from factors.persistence import stay_probability
-from sequences import se3
 from sequences.seeds import generator
 from sequences.types import Detection, LocalisationNoise
 
@@ -34,7 +41,6 @@ _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighe
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
 _LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
 _IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
-_MODE_RADIUS = (0.3, 0.02)  # rad, metres: particles so near to the heaviest make up its mode
 _REPORTED = 0.01  # classes less probable than this are not reported with poses
 
 
@@ -264,7 +270,7 @@ class Updater:
         modes: list[tuple[int, float, Array, Array, Array]] = []
         for c, particles in enumerate(weighted):
             if particles is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
-                modes += _modes(c, particles, self.model.shapes[c])
+                modes += modes_of(c, particles, self.model.shapes[c])
         best = int(np.argmax(probability))
         chosen = belief.classes[best]
         ledger = {
@@ -420,7 +426,7 @@ class Updater:
             rng: draws particles around the new pose.
         """
         T = found.T_world_centre[0]
-        if own is not None and symmetry.near(own.particles.best(1)[0], T, shape.symmetry, *_MODE_RADIUS):
+        if own is not None and symmetry.near(own.particles.best(1)[0], T, shape.symmetry, *MODE_RADIUS):
             return own
         mode = Gaussians(found.T_world_centre[:1], found.covariance[:1], np.zeros(1))
         remembered = self._remembered(belief, shape, T)
@@ -516,27 +522,3 @@ class Updater:
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
-
-
-def _modes(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:
-    """The heaviest particle's mode, moments matched, and the next one apart from it, if it weighs anything."""
-    out: list[tuple[int, float, Array, Array, Array]] = []
-    left = particles.log_weight.copy()
-    for _ in range(2):
-        heaviest = int(np.argmax(left))
-        if left[heaviest] < np.log(1e-3):
-            break
-        images = symmetry.nearest_image(particles.T_world_centre[heaviest], particles.T_world_centre, shape.symmetry)
-        r = se3.local(particles.T_world_centre[heaviest], images)
-        near = (np.linalg.norm(r[:, :3], axis=-1) < _MODE_RADIUS[0]) & (
-            np.linalg.norm(r[:, 3:], axis=-1) < _MODE_RADIUS[1]
-        )
-        near &= np.isfinite(left)
-        near[heaviest] = True
-        T, covariance = mixture.moment_match(images[near], None, left[near], iterations=4)
-        free = shape.symmetry.free_axes
-        # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
-        covariance = covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
-        out.append((c, float(log_sum(left[near])), T, covariance, free))
-        left[near] = -np.inf
-    return out

@@ -27,6 +27,9 @@ from sequences import se3
 
 Array = NDArray[np.float64]
 
+MODE_RADIUS = (0.3, 0.02)
+"""rad, metres: particles so near to the heaviest make up its mode"""
+
 
 @dataclass(frozen=True)
 class Particles:
@@ -131,3 +134,31 @@ def _spin(T: Array, shape: Shape, rng: np.random.Generator) -> Array:
         return T
     angle = rng.uniform(-np.pi, np.pi, size=(len(T), 1))
     return T @ se3.make(se3.so3_exp(angle * shape.symmetry.axes[0]), np.zeros(3))
+
+
+def modes_of(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:
+    """The heaviest particle's mode, moments matched, and the next one apart from it, if it weighs anything.
+
+    Returns:
+        class index `c`, log weight, T_world_centre (4, 4), covariance (6, 6) and free axes (6, f) of each.
+    """
+    out: list[tuple[int, float, Array, Array, Array]] = []
+    left = particles.log_weight.copy()
+    for _ in range(2):
+        heaviest = int(np.argmax(left))
+        if left[heaviest] < np.log(1e-3):
+            break
+        images = symmetry.nearest_image(particles.T_world_centre[heaviest], particles.T_world_centre, shape.symmetry)
+        r = se3.local(particles.T_world_centre[heaviest], images)
+        near = (np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0]) & (
+            np.linalg.norm(r[:, 3:], axis=-1) < MODE_RADIUS[1]
+        )
+        near &= np.isfinite(left)
+        near[heaviest] = True
+        T, covariance = mixture.moment_match(images[near], None, left[near], iterations=4)
+        free = shape.symmetry.free_axes
+        # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
+        covariance = covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
+        out.append((c, float(mixture.log_sum(left[near])), T, covariance, free))
+        left[near] = -np.inf
+    return out

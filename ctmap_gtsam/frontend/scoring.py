@@ -188,6 +188,34 @@ def score_depth(
     return Scores(out[:, 0], out[:, 1], out[:, 2], box)
 
 
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _differ(vertices, faces, solid, poses, camera, depth, out):
+    for part in numba.prange((len(poses) + PART - 1) // PART):
+        projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape)
+        chosen = np.empty((2, len(faces) + 1), np.int32)
+        for k in range(part * PART, min(part * PART + PART, len(poses))):
+            inverse_depth[:] = 0.0
+            project(vertices, poses[k], camera, projected)
+            rasterise(projected, faces, solid, chosen, inverse_depth, None)
+            total = 0.0
+            for v in range(depth.shape[0]):
+                for u in range(depth.shape[1]):
+                    if inverse_depth[v, u] > 0.0 and depth[v, u] > 0.0:
+                        total += (depth[v, u] - 1.0 / inverse_depth[v, u]) ** 2
+            out[k] = total
+
+
+def squared_differences(mesh: Mesh, tile: Tile, T_camera_object: Array) -> Array:
+    """d of Equation 6: the sum (K,) of squared depth differences between hypotheses (K, 4, 4) and a tile, m^2.
+
+    Over the samples that the object covers and the sensor measured, however far behind or in front.
+    """
+    poses = np.ascontiguousarray(T_camera_object, dtype=np.float64)
+    out = np.empty(len(poses))
+    _differ(coordinates(mesh), mesh.faces, mesh.is_solid, poses, intrinsics(tile.camera), tile.depth, out)
+    return out
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(projected, faces, solid, chosen, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
     """Point-to-plane normal equations of one pose in its own right tangent; returns the sum of weights."""

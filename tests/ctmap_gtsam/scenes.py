@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ctmap_gtsam.config import Config
+from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.observation import Observation, observe
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.runtime import settings
@@ -183,3 +184,35 @@ def cut(run: Run, n: int) -> Run:
     """The first n frames of a run."""
     visits = tuple(replace(v, frames=tuple(f for f in v.frames if f.index < n)) for v in run.visits)
     return replace(run, visits=tuple(v for v in visits if v.frames))
+
+
+def rows_of(estimate: Estimate, k: int) -> dict[int, tuple]:
+    """What is said at keyframe k, by object id."""
+    out = {}
+    for row, i in enumerate(estimate.object_id):
+        own = (estimate.modes.object == row) & (estimate.modes.keyframe == k)
+        modes = {name: value[own] for name, value in vars(estimate.modes).items() if name not in ("object", "keyframe")}
+        ledger = (estimate.ledger.object == row) & (estimate.ledger.keyframe == k)
+        if own.any():
+            out[int(i)] = (
+                estimate.class_probability[row, k],
+                estimate.existence[row, k],
+                estimate.in_view[row, k],
+                modes,
+                estimate.ledger.nats[ledger],
+            )
+    return out
+
+
+def assert_begins_with(whole: Estimate, part: Estimate) -> None:
+    """Law 2 of the model: what is said of a keyframe hangs on the past alone."""
+    n = len(part.keyframe_frame)
+    assert list(part.keyframe_frame) == list(whole.keyframe_frame[:n])
+    for k in range(n):
+        all_, cut_ = rows_of(whole, k), rows_of(part, k)
+        assert all_.keys() == cut_.keys()
+        for i in all_:
+            for a, b in zip(all_[i][:3] + all_[i][4:], cut_[i][:3] + cut_[i][4:], strict=True):
+                np.testing.assert_array_equal(a, b)
+            for name, value in all_[i][3].items():
+                np.testing.assert_array_equal(value, cut_[i][3][name])
