@@ -156,7 +156,7 @@ class RunWriter:
         for one in self._catalogue.classes:
             _write(models / layout.mesh_name(one.obj_id), encode_mesh(one.mesh))
         write_json(models / layout.MODELS_INFO, {str(c.obj_id): _model_json(c) for c in self._catalogue.classes})
-        write_json(self._folder / layout.CATALOGUE, {str(c.obj_id): _class_json(c) for c in self._catalogue.classes})
+        write_json(self._folder / layout.CATALOGUE, {str(c.obj_id): class_json(c) for c in self._catalogue.classes})
         write_json(self._folder / layout.CTMAP, self._description())
         for visit in self._visits.values():
             visit.finish()
@@ -294,7 +294,8 @@ def _camera_json(camera: Camera, depth_scale: float) -> Json:
     return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, **size, "depth_scale": depth_scale}
 
 
-def _class_json(c: ObjectClass) -> Json:
+def class_json(c: ObjectClass) -> Json:
+    """What catalogue.json says of a class."""
     return {
         "name": c.name,
         "category": c.category,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ctmap_gtsam.cli import benches, estimators, runs, tools
+from ctmap_gtsam.cli import benches, estimators, learners, runs, tools
 from ctmap_gtsam.cli.guard import GuardedGroup
 
 app = typer.Typer(
@@ -49,4 +49,5 @@ app.command()(estimators.compare)
 app.command()(estimators.report)
 app.command()(tools.config)
 app.add_typer(runs.simulate_app, name="simulate")
+app.add_typer(learners.train_app, name="train")
 app.add_typer(benches.bench_app, name="bench")

@@ -11,6 +11,7 @@ import typer
 
 if TYPE_CHECKING:
     from ctmap_gtsam.estimate import Estimate
+    from ctmap_gtsam.learning.persistence import Persistence
     from sequences.catalogue import Catalogue
     from sequences.validation import Facts, Inspection
 
@@ -47,6 +48,23 @@ def _show_facts(facts: Facts) -> None:
     )
     for note in facts.derived:
         typer.echo(f"taken for granted: {note}")
+
+
+def show_persistence(learned: Sequence[Persistence], catalogue: Catalogue) -> None:
+    """mu of each group of classes, and how well it is known."""
+    _show_table(
+        ("classes", "mu s", "from", "to", "gaps", "moves"),
+        (
+            (
+                ", ".join(catalogue[i].name for i in one.obj_ids),
+                f"{one.mu_s:.4g}",
+                *(f"{end:.3g}" for end in one.interval_s),
+                one.gaps,
+                f"{one.moves:.1f}",
+            )
+            for one in learned
+        ),
+    )
 
 
 def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:

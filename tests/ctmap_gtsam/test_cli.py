@@ -20,6 +20,7 @@ COMMANDS = [
     ["smooth"],
     ["compare"],
     ["report"],
+    ["train", "persistence"],
     ["bench", "render"],
     ["bench", "paper"],
 ]

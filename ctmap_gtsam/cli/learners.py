@@ -1,0 +1,51 @@
+"""Commands that learn what the model takes for given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from ctmap_gtsam.cli.options import writable
+from ctmap_gtsam.cli.show import show_persistence
+
+train_app = typer.Typer(no_args_is_help=True, help="Learn what the model takes for given, from runs.")
+
+
+@train_app.callback()
+def train() -> None:
+    """Learn what the model takes for given, from runs."""
+
+
+@train_app.command()
+def persistence(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="A new catalogue.json.", show_default=False)],
+    estimates: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--estimate",
+            metavar="NPZ",
+            help="An estimate of one of the runs, used in place of its truth; repeatable.",
+        ),
+    ] = None,
+    by: Annotated[
+        Literal["category", "class"], typer.Option("--by", help="Whose classes share their mu.")
+    ] = "category",
+) -> None:
+    """Learn how long things stay where they were put (mu of Equation 3), from gaps between visits.
+
+    Moves come from the truth of a run, or from an estimate of it, whose own prior is taken out first. Writes a
+    catalogue.json of all the runs' classes, with what was learned and how well it is known (95 % of the posterior).
+
+    Example: `ctmap train persistence recordings/kitchen --estimate results/smooth-ct.npz --out catalogue.json`
+    """
+    from ctmap_gtsam.learning.persistence import described, learn_from
+    from sequences.atomic import write_json
+
+    writable(out.parent)
+    catalogue, learned = learn_from(runs, estimates or [], by=by)
+    write_json(out, described(catalogue, learned))
+    show_persistence(learned, catalogue)
+    typer.echo(out)
