@@ -21,7 +21,7 @@ from factors.measurement import (
     persistent_class_log_evidence,
 )
 from sequences.catalogue import Catalogue
-from sequences.types import Detection
+from sequences.types import Detection, LocalisationNoise
 
 Array = NDArray[np.float64]
 
@@ -69,6 +69,20 @@ class Model:
         p = self.config.prediction
         dt_s = min(dt_s, p.significant_period_s)
         return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
+
+    def shared_variance(self, localisation: LocalisationNoise, away_m: float) -> Array:
+        """(6,) by how much all that one view says of an object's pose in the world may be off together.
+
+        Localisation's error, which turns about the camera, and the depth's bias: more samples don't lessen them.
+
+        Args:
+            localisation: of the recorded camera poses.
+            away_m: from the camera to the object.
+        """
+        sensor = self.config.sensor
+        turned = localisation.rotation_rad**2 + sensor.bias_rotation_rad**2
+        moved = localisation.translation_m**2 + (away_m * localisation.rotation_rad) ** 2 + sensor.bias_translation_m**2
+        return np.repeat([turned, moved], 3)
 
     def log_uniform(self, shape: Shape) -> float:
         """log density of a pose anywhere in the neighbourhood, over poses modulo the object's symmetries."""

@@ -31,6 +31,10 @@ class Sensor:
     kappa: float = option(0.05, "one over the number of samples whose noise is correlated", low=0.0, high=1.0)
     fresh_view_rad: float = option(0.1, "change of viewing direction after which depth errs anew, rad", low=1e-3)
     fresh_view_s: float = option(2.0, "time after which depth errs anew even in the same view, s", low=1e-3)
+    bias_rotation_rad: float = option(
+        0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
+    )
+    bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
     occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
 
 
@@ -136,10 +140,6 @@ class Smoother:
     search_share: float = option(0.7, "effort of such a search, as a share of the configured one", low=0.01)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
-    bias_rotation_rad: float = option(
-        0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
-    )
-    bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
 
 
 @dataclass(frozen=True)

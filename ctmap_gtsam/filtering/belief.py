@@ -267,10 +267,13 @@ class Updater:
         posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
         rivals = (belief.log_clutter, 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
+        # particles are what views of this camera agree on; that the camera itself is elsewhere they can't know
+        shared = np.diag(self.model.shared_variance(self.localisation, float(np.linalg.norm(belief.viewpoint))))
         modes: list[tuple[int, float, Array, Array, Array]] = []
         for c, particles in enumerate(weighted):
             if particles is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
-                modes += modes_of(c, particles, self.model.shapes[c])
+                found = modes_of(c, particles, self.model.shapes[c])
+                modes += [(c, log_weight, T, covariance + shared, free) for _, log_weight, T, covariance, free in found]
         best = int(np.argmax(probability))
         chosen = belief.classes[best]
         ledger = {

@@ -226,13 +226,10 @@ def judge(
 
 def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:
     """(6,) how far two views of a still object differ, for localisation's error and the depth's bias."""
-    noise, bias = recording.run.localisation, model.config.smoother
     seen = [s for s in stages if len(s.log_evidence)]
     cameras = np.stack([recording.T_world_camera(s.keyframe)[:3, 3] for s in seen])
     away = float(np.median(np.linalg.norm(cameras - np.stack([s.T_world_centre[0, :3, 3] for s in seen]), axis=-1)))
-    turned = noise.rotation_rad**2 + bias.bias_rotation_rad**2
-    moved = noise.translation_m**2 + (away * noise.rotation_rad) ** 2 + bias.bias_translation_m**2
-    return np.repeat([turned, moved], 3)
+    return model.shared_variance(recording.run.localisation, away)
 
 
 def _stage(sighting: Sighting, c: int, n_keyframes: int, recording: Recording) -> Stage:

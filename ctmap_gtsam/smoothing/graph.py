@@ -221,7 +221,7 @@ def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
     key = bias_key(row, visit)
     if built.initial.exists(key):
         return
-    settings = model.config.smoother
+    settings = model.config.sensor
     sigmas = np.repeat([settings.bias_rotation_rad, settings.bias_translation_m], 3)
     built.initial.insert(key, np.zeros(6))
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)

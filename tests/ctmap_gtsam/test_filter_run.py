@@ -7,7 +7,9 @@ import pytest
 
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
+from ctmap_gtsam.model import Model
 from factors.symmetry import Symmetry, residual
+from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import CHEAP, assert_begins_with, config_of, cut, small_run
 
 CONFIG = config_of(*CHEAP, "filter.search_every=2")
@@ -61,6 +63,15 @@ def test_mixtures_are_normalised_and_covariances_proper(estimate):
                 assert np.exp(m.log_weight[own]).sum() <= 1.0 + 1e-9
     assert (np.linalg.eigvalsh(m.covariance)[:, 0] > 0).all()
     assert np.isfinite(m.T_world_object).all()
+
+
+def test_no_pose_is_surer_than_the_camera_that_saw_it(scene):
+    """More views of a camera that may be elsewhere say no more of where a thing is in the world."""
+    noise = LocalisationNoise(rotation_rad=0.01, translation_m=0.02)
+    estimate = filter_run(replace(scene[0], localisation=noise), CONFIG)
+    away = np.linalg.norm(scene[0].frames[0].T_world_camera[:3, 3])
+    least = Model(scene[0].catalogue, CONFIG).shared_variance(noise, 0.8 * away)
+    assert (estimate.modes.covariance[:, range(6), range(6)] > least).all()
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(scene, estimate, tmp_path):

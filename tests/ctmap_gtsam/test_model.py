@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
 
 MODEL = model_of("mug", "soup_can", "cereal_box")
@@ -52,3 +53,13 @@ def test_where_nothing_is_nothing_exists_and_without_poses_neither():
     exists, classes = MODEL.existence(nowhere, nowhere, 50.0, 0.0)
     assert exists == 0.0
     assert classes.sum() == pytest.approx(1.0)
+
+
+@given(st.floats(0.0, 0.1), st.floats(0.0, 0.1), st.floats(0.1, 5.0))
+def test_what_views_share_grows_with_distance_by_the_cameras_turn_alone(rotation, translation, away):
+    near, far = (MODEL.shared_variance(LocalisationNoise(rotation, translation), d) for d in (away, 2.0 * away))
+    np.testing.assert_allclose(far[:3], near[:3])
+    np.testing.assert_allclose(far[3:] - near[3:], 3.0 * (away * rotation) ** 2, atol=1e-12)
+    still = MODEL.shared_variance(LocalisationNoise(0.0, 0.0), away)
+    sensor = MODEL.config.sensor
+    np.testing.assert_allclose(still, np.repeat([sensor.bias_rotation_rad, sensor.bias_translation_m], 3) ** 2)

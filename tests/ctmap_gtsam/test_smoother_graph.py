@@ -19,8 +19,8 @@ from tests.factors.strategies import SYMMETRIES, random_image
 CONFIG = config_of(
     "prediction.rotation_rate=1e-6",
     "prediction.translation_rate=0.003",
-    "smoother.bias_rotation_rad=1e-6",
-    "smoother.bias_translation_m=0.0015",
+    "sensor.bias_rotation_rad=1e-6",
+    "sensor.bias_translation_m=0.0015",
     "smoother.tolerance=1e-12",
 )
 MODEL = Model(classes("mug"), CONFIG, context=False)
@@ -82,7 +82,7 @@ def rauch_tung_striebel(problem):
         M[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = value
         return M
 
-    bias = CONFIG.smoother.bias_translation_m**2
+    bias = CONFIG.sensor.bias_translation_m**2
     # a thing at z seen from a camera that errs by e stands at z + e + b + noise; it is measured first at keyframe 0
     z, R = problem.measured[0]
     m = np.zeros(size)
@@ -149,7 +149,7 @@ def test_a_thousand_views_of_one_visit_leave_the_bias():
         problem = Problem(times, np.arange(n) * visits // n, measured, LocalisationNoise())
         return np.sqrt(solved(problem, model)[1].objects[0][n // 2][1][3, 3])
 
-    bias = CONFIG.smoother.bias_translation_m
+    bias = CONFIG.sensor.bias_translation_m
     assert sigma(300, 1) == pytest.approx(bias, rel=0.02)
     assert sigma(300, 2) == pytest.approx(bias / np.sqrt(2), rel=0.02)
 
