@@ -118,7 +118,6 @@ class _Filter:
         self.place.update(observation)
         tracks = {track.track_id: track for track in self.associator.tracks()}
         before = {i: cloud.best() for i, cloud in self.clouds.items()}
-        reported = {}
         for i, cloud in sorted(self.clouds.items()):
             others = {j: best for j, best in before.items() if j != i}
             rng = generator(self.model.config.seed, "paper.step", i, observation.frame.index)
@@ -128,9 +127,7 @@ class _Filter:
         for i in sorted(tracks.keys() - self.clouds.keys()):
             started = self._start(tracks[i], observation)
             self.clouds[i] = self._weigh(started, tracks[i].at(observation.keyframe), observation, self._around(before))
-        for i, cloud in sorted(self.clouds.items()):
-            reported[i] = self._report(cloud, observation.frame)
-        return reported
+        return {i: self._report(cloud, observation.frame) for i, cloud in sorted(self.clouds.items())}
 
     def _around(self, others: Mapping[int, tuple[int, Array]]) -> Surroundings:
         shapes = self.model.shapes

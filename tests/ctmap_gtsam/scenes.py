@@ -216,3 +216,12 @@ def assert_begins_with(whole: Estimate, part: Estimate) -> None:
                 np.testing.assert_array_equal(a, b)
             for name, value in all_[i][3].items():
                 np.testing.assert_array_equal(value, cut_[i][3][name])
+
+
+def assert_the_seed_decides(estimate: Callable[[int], Estimate], folder: Path) -> None:
+    """The same seed gives the same bytes, another seed others."""
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        estimate(seed).save(folder / f"{name}.npz")
+    a, b, c = ((folder / f"{name}.npz").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
