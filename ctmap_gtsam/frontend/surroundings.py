@@ -136,7 +136,7 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
         low, high = heights.min(axis=-1), heights.max(axis=-1)
         floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
         sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
-        potential = np.logaddexp(floating, np.log(settings.other_support)) + doubted(sinking, settings.doubt)
+        potential = doubted(floating, settings.other_support) + doubted(sinking, settings.doubt)
         concerned = above & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
         best = np.where(concerned, np.maximum(best, potential), best)
     return np.where(np.isneginf(best), 0.0, best)
