@@ -20,10 +20,16 @@ from factors.measurement import (
     detection_log_ratio,
     persistent_class_log_evidence,
 )
-from sequences.catalogue import Catalogue
+from factors.persistence import stay_probability
+from sequences.catalogue import Catalogue, ObjectClass
 from sequences.types import Detection, LocalisationNoise
 
 Array = NDArray[np.float64]
+
+
+def localisation_variance(noise: LocalisationNoise, away_m: float) -> tuple[float, float]:
+    """By how much localisation turns (rad^2) and moves (m^2) what a camera sees at a distance; its turn moves, too."""
+    return noise.rotation_rad**2, noise.translation_m**2 + (away_m * noise.rotation_rad) ** 2
 
 
 class Model:
@@ -70,6 +76,11 @@ class Model:
         dt_s = min(dt_s, p.significant_period_s)
         return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
 
+    def stay_probability(self, known: ObjectClass, away_s: float) -> float:
+        """Equation 3 for a thing of a class that nobody saw for so many seconds; what can't be moved stays."""
+        r1 = self.config.prediction.stay_limit
+        return float(stay_probability(away_s, known.persistence_s, r1, 1.0 - r1)) if known.movable else 1.0
+
     def shared_variance(self, localisation: LocalisationNoise, away_m: float) -> Array:
         """(6,) by how much all that one view says of an object's pose in the world may be off together.
 
@@ -80,9 +91,8 @@ class Model:
             away_m: from the camera to the object.
         """
         sensor = self.config.sensor
-        turned = localisation.rotation_rad**2 + sensor.bias_rotation_rad**2
-        moved = localisation.translation_m**2 + (away_m * localisation.rotation_rad) ** 2 + sensor.bias_translation_m**2
-        return np.repeat([turned, moved], 3)
+        turned, moved = localisation_variance(localisation, away_m)
+        return np.repeat([turned + sensor.bias_rotation_rad**2, moved + sensor.bias_translation_m**2], 3)
 
     def log_uniform(self, shape: Shape) -> float:
         """log density of a pose anywhere in the neighbourhood, over poses modulo the object's symmetries."""

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from ctmap_gtsam.config import Config
 
 NoContext = Annotated[bool, typer.Option("--no-context", help="Leave the context between objects out.")]
-Literal = Annotated[bool, typer.Option("--paper", help="Algorithm 1 and the potentials to the letter of the paper.")]
+AsInPaper = Annotated[bool, typer.Option("--paper", help="Algorithm 1 and the potentials to the letter of the paper.")]
 
 
 def filter(
     run: RunFolder,
     out: Out,
     no_context: NoContext = False,
-    paper: Literal = False,
+    paper: AsInPaper = False,
     scene: Scene = None,
     config_file: ConfigFile = None,
     assignments: Assignments = None,

@@ -10,7 +10,7 @@ import typer
 from ctmap_gtsam.cli.options import writable
 from ctmap_gtsam.cli.show import show_persistence
 
-train_app = typer.Typer(no_args_is_help=True, help="Learn what the model takes for given, from runs.")
+train_app = typer.Typer(no_args_is_help=True)
 
 
 @train_app.callback()

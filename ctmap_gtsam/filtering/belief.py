@@ -23,12 +23,11 @@ from ctmap_gtsam.frontend.observation import Observation
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
-from ctmap_gtsam.model import Model
+from ctmap_gtsam.model import Model, localisation_variance
 from ctmap_gtsam.shapes import Shape
 from factors import mixture, symmetry
 from factors.measurement import box_iou
 from factors.mixture import log_sum
-from factors.persistence import stay_probability
 from sequences.seeds import generator
 from sequences.types import Detection, LocalisationNoise
 
@@ -328,9 +327,7 @@ class Updater:
         if gap < settings.significant_period_s:
             return belief
         total = belief.class_log_evidence(self.model)
-        r1 = settings.stay_limit
-        stay = np.array([stay_probability(gap, s.source.persistence_s, r1, 1.0 - r1) for s in self.model.shapes])
-        stay = np.where([s.source.movable for s in self.model.shapes], stay, 1.0)
+        stay = np.array([self.model.stay_probability(s.source, gap) for s in self.model.shapes])
         with np.errstate(divide="ignore"):
             left, log_stay = float(log_sum(total + np.log1p(-stay))), np.log(stay)
         classes = tuple(
@@ -444,14 +441,13 @@ class Updater:
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
-        noise = self.localisation
         dt = max((observation.frame.time_ns - before_ns) * 1e-9, 1e-3)
         walked = np.diag(self.model.prediction_covariance(dt))
         # two recorded poses that lie closer than the correlation time err together
-        apart = 2.0 * (1.0 - np.exp(-dt / max(noise.correlation_time_s, 1e-9)))
+        apart = 2.0 * (1.0 - np.exp(-dt / max(self.localisation.correlation_time_s, 1e-9)))
         away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
-        seems_off = apart * (noise.translation_m**2 + (away * noise.rotation_rad) ** 2)
-        return Spread(float(np.sqrt(walked[0] + apart * noise.rotation_rad**2)), float(np.sqrt(walked[3] + seems_off)))
+        turned, moved = localisation_variance(self.localisation, away)
+        return Spread(float(np.sqrt(walked[0] + apart * turned)), float(np.sqrt(walked[3] + apart * moved)))
 
     def _weigh(
         self,

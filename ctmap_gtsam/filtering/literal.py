@@ -24,7 +24,7 @@ from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Reported
-from ctmap_gtsam.filtering.particles import Particles, modes_of
+from ctmap_gtsam.filtering.particles import Particles, modes_of, systematic
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth, observations
@@ -36,7 +36,6 @@ from ctmap_gtsam.shapes import Shape
 from factors import prediction
 from factors.measurement import box_overlap_min, paper_log_potential, paper_log_similarity
 from factors.mixture import normalised
-from factors.persistence import stay_probability
 from sequences import se3
 from sequences.progress import SILENT, Progress
 from sequences.seeds import generator
@@ -158,24 +157,19 @@ class _Filter:
     ) -> Cloud:
         """Resample, then draw from phi_p: Equation 2 where the particle is in view or stays, else a move."""
         n = len(cloud.log_weight)
-        picks = _systematic(cloud.log_weight, float(rng.random()))
+        picks = systematic(cloud.log_weight, n, float(rng.random()))
         classes, T = cloud.class_index[picks], cloud.T_world_centre[picks]
         away_s = (frame.time_ns - cloud.seen_ns) * 1e-9
         moves = np.zeros(n, dtype=np.bool_)
         if away_s >= self.model.config.prediction.significant_period_s and others:
-            moves = ~_in_view(T, frame) & (rng.random(n) >= self._stay(classes, away_s))
+            stay = np.array([self.model.stay_probability(s.source, away_s) for s in self.model.shapes])
+            moves = ~_in_view(T, frame) & (rng.random(n) >= stay[classes])
         sigma = np.repeat([self.settings.rotation_sigma_rad, self.settings.translation_sigma_m], 3) ** 2
         # the paper's exponent has no 1/2: its Sigma is twice a covariance
         T = prediction.sample(T, np.diag(sigma) / 2.0, rng.normal(size=(n, 6)))
         if moves.any():
             T[moves] = self._moved(classes[moves], T[moves], others, rng)
         return replace(cloud, class_index=classes, T_world_centre=T)
-
-    def _stay(self, classes: Ints, away_s: float) -> Array:
-        r1 = self.model.config.prediction.stay_limit
-        mu = np.array([shape.source.persistence_s for shape in self.model.shapes])
-        movable = np.array([shape.source.movable for shape in self.model.shapes])
-        return np.where(movable, stay_probability(away_s, mu, r1, 1.0 - r1), 1.0)[classes]
 
     def _moved(
         self, classes: Ints, T: Array, others: Mapping[int, tuple[int, Array]], rng: np.random.Generator
@@ -277,10 +271,3 @@ def _spots_on(shape: Shape, T_world_centre: Array, up: Array, n: int, rng: np.ra
     # uniform in a triangle (Osada et al., ACM Trans. Graph. 2002)
     a, b = np.sqrt(rng.random(n))[:, None], rng.random(n)[:, None]
     return np.asarray((1 - a) * faces[:, 0] + a * (1 - b) * faces[:, 1] + a * b * faces[:, 2])
-
-
-def _systematic(log_weight: Array, uniform: float) -> Ints:
-    """(M,) picks with probability proportional to the weights."""
-    n = len(log_weight)
-    edges = np.cumsum(np.exp(log_weight))
-    return np.minimum(np.searchsorted(edges, (np.arange(n) + uniform) / n * edges[-1]), n - 1)

@@ -51,9 +51,7 @@ class Particles:
 
     def resampled(self, n: int, uniform: float) -> Array:
         """n poses (n, 4, 4) by systematic resampling with one number in [0, 1)."""
-        edges = np.cumsum(np.exp(self.log_weight))
-        picks = np.searchsorted(edges, (np.arange(n) + uniform) / n * edges[-1])
-        return self.T_world_centre[np.minimum(picks, len(edges) - 1)]
+        return self.T_world_centre[systematic(self.log_weight, n, uniform)]
 
 
 @dataclass(frozen=True)
@@ -89,6 +87,13 @@ class Gaussians:
         reduced = (S.projection @ r[..., None])[..., 0]
         information = np.linalg.inv(S.reduced_covariance(self.covariance))
         return mixture.mixture_log_density(reduced, information, self.log_weight)
+
+
+def systematic(log_weight: Array, n: int, uniform: float) -> NDArray[np.int64]:
+    """n picks by systematic resampling of log weights (M,), with one number in [0, 1)."""
+    edges = np.cumsum(np.exp(log_weight))
+    picks = np.searchsorted(edges, (np.arange(n) + uniform) / n * edges[-1])
+    return np.minimum(picks, len(edges) - 1)
 
 
 def predict(particles: Particles, n: int, spread: Spread, shape: Shape, rng: np.random.Generator) -> Array:

@@ -20,7 +20,6 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import prediction, symmetry
 from factors.mixture import LOG_2PI, log_sum
-from factors.persistence import stay_probability
 from sequences import se3
 
 Array = NDArray[np.float64]
@@ -126,9 +125,7 @@ class _Between:
     def of(cls, a: Stage, b: Stage, model: Model, shape: Shape, noise_variance: Array) -> _Between:
         settings = model.config.prediction
         dt = max(b.time_s - a.time_s, 1e-3)
-        unseen = dt > settings.significant_period_s and shape.source.movable
-        r1 = settings.stay_limit
-        stay = float(stay_probability(dt, shape.source.persistence_s, r1, 1.0 - r1)) if unseen else 1.0
+        stay = model.stay_probability(shape.source, dt) if dt > settings.significant_period_s else 1.0
         sigma = model.prediction_covariance(dt) + np.diag(noise_variance)
         return cls(min(stay, 1.0 - settings.jump_probability), sigma)
 
