@@ -5,8 +5,8 @@ The public names, each loaded when it is first used::
     from ctmap_gtsam import compare, filter_run, load_run, smooth_run
 
     run = load_run("recordings/kitchen")
-    estimates = {"filter-ct": filter_run(run), "smooth-ct": smooth_run(run)}
-    print(compare(run, estimates).table())
+    filtered = filter_run(run)
+    print(compare(run, {"filter-ct": filtered, "smooth-ct": smooth_run(run, filtered)}).table())
 """
 
 from __future__ import annotations

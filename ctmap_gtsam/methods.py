@@ -62,8 +62,8 @@ def _literal(run: Run, config: Config, progress: Progress, *, context: bool) -> 
     return literal_filter_run(run, config, context=context, progress=progress)
 
 
-def _smooth(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
-    return smooth_run(run, config, context=context, progress=progress)
+def _smooth(run: Run, config: Config, progress: Progress, forward: Estimate) -> Estimate:
+    return smooth_run(run, forward, config, progress=progress)
 
 
 METHODS: dict[str, Method] = {
@@ -90,9 +90,9 @@ METHODS: dict[str, Method] = {
                partial(_filter, context=True), _needs_detections),
         Method("last-copied-back", "filter-ct's last map of each visit in all of the visit's frames", "estimate",
                copy_back, _needs_detections, needs=("filter-ct",)),
-        Method("smooth-t", "the factor-graph smoother without context", "estimate",
-               partial(_smooth, context=False), _needs_detections),
-        Method("smooth-ct", "the factor-graph smoother, each frame seeing the whole run", "estimate",
-               partial(_smooth, context=True), _needs_detections),
+        Method("smooth-t", "the factor-graph smoother without context, from filter-t's objects", "estimate",
+               _smooth, _needs_detections, needs=("filter-t",)),
+        Method("smooth-ct", "the factor-graph smoother from filter-ct's objects, each frame seeing the whole run",
+               "estimate", _smooth, _needs_detections, needs=("filter-ct",)),
     )
 }  # fmt: skip

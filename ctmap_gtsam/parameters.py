@@ -135,9 +135,10 @@ class Paper:
 class Smoother:
     """The factor graph and its rounds."""
 
+    unmeasured: float = option(
+        0.02, "chance that none of a view's modes is the pose of the thing that is there", low=0.0, high=0.5
+    )
     rounds: int = option(2, "re-weighting rounds after the first, at most", low=2)
-    searches: int = option(5, "keyframes of a track with a search", low=1)
-    search_share: float = option(0.7, "effort of such a search, as a share of the configured one", low=0.01)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
 

@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage, solve
 from ctmap_gtsam.smoothing.graph import Measured
-from ctmap_gtsam.smoothing.modes import Recording, Sighting, in_world
+from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, in_world
 from factors.mixture import log_sum
 
 Array = NDArray[np.float64]
@@ -28,10 +27,10 @@ _STAYED = 0.5
 
 @dataclass(frozen=True)
 class Thing:
-    """One object: its tracks, sightings, and the trellis of every class."""
+    """One object: its detections, sightings, and the trellis of every class."""
 
     object_id: int
-    tracks: tuple[Track, ...]
+    boxes: Boxes
     sightings: Mapping[int, Sighting]
     """by keyframe"""
     stages: Mapping[int, tuple[Stage, ...]]
@@ -148,8 +147,8 @@ class Thing:
         for i, (stage, state) in enumerate(zip(self.stages[c], self.posteriors[c].path, strict=True)):
             if i:
                 stayed = stayed and self.posteriors[c].moved[i - 1] < _STAYED
-            if state == len(stage.log_evidence):
-                stayed = False
+            if state >= len(stage.log_evidence):
+                stayed = stayed and state == len(stage.log_evidence)
                 continue
             modes = self.sightings[stage.keyframe].modes[c]
             assert modes is not None
@@ -184,7 +183,7 @@ class Thing:
         i = self.keyframes.index(keyframe)
         posterior = self.posteriors[self.reported_class]
         marginal, state = posterior.modes[i], posterior.path[i]
-        if state == len(marginal) - 1:
+        if state >= len(marginal) - 2:
             return 0.0
         return float(np.log(max(marginal[state] / max(1.0 - marginal[-1], 1e-300), 1e-300)))
 
@@ -199,7 +198,7 @@ def _nearest(sorted_keyframes: list[int], keyframe: int) -> int:
 
 def judge(
     object_id: int,
-    tracks: tuple[Track, ...],
+    boxes: Boxes,
     sightings: Mapping[int, Sighting],
     recording: Recording,
     model: Model,
@@ -216,12 +215,12 @@ def judge(
         stages[c] = tuple(_stage(sightings[k], c, len(keyframes), recording) for k in keyframes)
         posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], recording, model))
         evidence[c] = posteriors[c].log_evidence
-    scores = _score_evidence(tracks, recording, model)
+    scores = _score_evidence(boxes, recording, model)
     clutter = float(sum(s.log_clutter for s in sightings.values()))
     log_evidence = evidence + scores - np.log(len(model.shapes))
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
     posterior = model.existence(log_evidence, posed, clutter, 0.0)
-    return Thing(object_id, tracks, sightings, stages, posteriors, log_evidence, scores, posterior)
+    return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior)
 
 
 def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:
@@ -243,11 +242,10 @@ def _stage(sighting: Sighting, c: int, n_keyframes: int, recording: Recording) -
     return Stage(sighting.keyframe, recording.time_s(sighting.keyframe), T, modes.covariance, nats)
 
 
-def _score_evidence(tracks: tuple[Track, ...], recording: Recording, model: Model) -> Array:
+def _score_evidence(boxes: Boxes, recording: Recording, model: Model) -> Array:
     """(C,) what the detector's score vectors say, a persistent belief a visit."""
     by_visit: dict[int, Array] = {}
-    for track in tracks:
-        for k, detection in zip(track.keyframes, track.detections, strict=True):
-            visit = recording.run.frames[int(recording.keyframes[k])].visit
-            by_visit[visit] = by_visit.get(visit, np.zeros(len(model.shapes))) + model.class_scores(detection)
+    for k, detection in sorted(boxes.items()):
+        visit = recording.run.frames[int(recording.keyframes[k])].visit
+        by_visit[visit] = by_visit.get(visit, np.zeros(len(model.shapes))) + model.class_scores(detection)
     return np.asarray(sum((model.class_evidence(s) for s in by_visit.values()), np.zeros(len(model.shapes))))

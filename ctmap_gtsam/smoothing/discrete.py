@@ -1,11 +1,14 @@
 """The trellis: modes, absences and moves of one object of one class over the run, by forward-backward.
 
-States at a keyframe are the view's modes and "gone" (not here at all: not yet, no longer, or elsewhere). A mode's
-evidence is its likelihood times the volume under it, which is the integral of exp(log f - 1/2 r^T L r) over poses;
-transitions integrate the prediction over the mode's Gaussian and over what its most probable past knows (a switching
-Kalman filter that keeps one component a state; Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single
-views would charge a long track for every view anew. The normaliser is the class evidence, against nothing being there;
-one pass gives which mode, when present, and whether it moved. Log space throughout (Rabiner, Proc. IEEE 1989).
+States at a keyframe are the view's modes, "unmeasured" (it is where it was, and none of the modes is its pose) and
+"gone" (not here at all: not yet, no longer, or elsewhere). A mode's evidence is its likelihood times the volume under
+it, which is the integral of exp(log f - 1/2 r^T L r) over poses; transitions integrate the prediction over the mode's
+Gaussian and over what its most probable past knows (a switching Kalman filter that keeps one component a state;
+Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single views would charge a long track for every view
+anew. Unmeasured explains a view as well as a pose could that has nothing to do with the thing, at a price: a view that
+is misread, or a silhouette that something unknown hides, is no move. The normaliser is the class evidence, against
+nothing being there; one pass gives which mode, when present, and whether it moved. Log space throughout (Rabiner,
+Proc. IEEE 1989).
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ PRESENT_AT_FIRST = 0.5
 
 @dataclass(frozen=True)
 class Stage:
-    """The states of one keyframe in view: n modes, and gone."""
+    """The states of one keyframe in view: n modes, unmeasured, and gone."""
 
     keyframe: int
     time_s: float
@@ -49,9 +52,9 @@ class Posterior:
     log_evidence: float
     """log of all paths together, against nothing ever being there"""
     modes: tuple[Array, ...]
-    """(n + 1,) marginal of each stage's states, gone last"""
+    """(n + 2,) marginal of each stage's states: modes, unmeasured, gone"""
     path: tuple[int, ...]
-    """the most probable states; n stands for gone"""
+    """the most probable states; n stands for unmeasured, n + 1 for gone"""
     moved: Array
     """(stages - 1,) probability that the object did not simply stay between two stages, given it was there at either"""
 
@@ -65,11 +68,11 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
         shape: the class.
         noise_variance: (6,) of what moves a mode between two views but isn't the object: localisation's error.
     """
-    emissions = [_emission(stage, shape) for stage in stages]
-    uniform = model.log_uniform(shape)
-    first = np.full(len(stages[0].log_evidence), np.log(PRESENT_AT_FIRST) + uniform)
-    start = np.append(first, np.log1p(-PRESENT_AT_FIRST))
-    forward, steps, known = [start + emissions[0]], [], _Known(stages[0].T_world_centre, stages[0].covariance)
+    emissions = [_emission(stage, model, shape) for stage in stages]
+    first = np.full(len(stages[0].log_evidence), np.log(PRESENT_AT_FIRST) + model.log_uniform(shape))
+    # what hasn't been met yet can't be where it was
+    start = np.concatenate([first, [-np.inf, np.log1p(-PRESENT_AT_FIRST)]])
+    forward, steps, known = [start + emissions[0]], [], _Known.at_first(stages[0])
     for a, b, emission in zip(stages, stages[1:], emissions[1:], strict=False):
         between = _Between.of(a, b, model, shape, noise_variance)
         step = _transition(known, b, between, model, shape)
@@ -88,28 +91,39 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
 @dataclass(frozen=True)
 class _Step:
     log_total: Array
-    """(n + 1, m + 1) log probability (density at modes) of each transition"""
+    """(n + 2, m + 2) log probability (density at modes) of each transition"""
     log_stay: Array
-    """(n, m) the part of mode-to-mode transitions in which the object stayed"""
+    """(n + 1, m + 1) the part of transitions among modes and unmeasured in which the object stayed"""
 
 
-def _emission(stage: Stage, shape: Shape) -> Array:
-    """(n + 1,): a mode's integral over poses; gone is what everything is compared with, 0."""
+def _emission(stage: Stage, model: Model, shape: Shape) -> Array:
+    """(n + 2,): a mode's integral over poses; gone is what everything is compared with, 0."""
     if not len(stage.log_evidence):
-        return np.zeros(1)
+        return np.zeros(2)  # nothing was measured, nothing is misread
     reduced = shape.symmetry.reduced_covariance(stage.covariance)
     volume = 0.5 * (np.linalg.slogdet(reduced)[1] + reduced.shape[-1] * LOG_2PI)
-    return np.append(stage.log_evidence + volume, 0.0)
+    modes = stage.log_evidence + volume
+    anyhow = max(float(log_sum(modes)) + model.log_uniform(shape), 0.0)
+    p = model.config.smoother.unmeasured
+    with np.errstate(divide="ignore"):
+        return np.concatenate([modes + np.log1p(-p), [np.log(p) + anyhow, 0.0]])
 
 
 @dataclass(frozen=True)
 class _Known:
-    """What each mode's most probable past and the mode itself know together."""
+    """What the most probable past of each mode and of unmeasured, and the state itself, know together."""
 
     T_world_centre: Array
-    """(n, 4, 4)"""
+    """(n + 1, 4, 4)"""
     covariance: Array
-    """(n, 6, 6)"""
+    """(n + 1, 6, 6)"""
+
+    @classmethod
+    def at_first(cls, stage: Stage) -> _Known:
+        """Modes know themselves; unmeasured is impossible here, so what it knows is never asked for."""
+        return cls(
+            np.concatenate([stage.T_world_centre, np.eye(4)[None]]), np.concatenate([stage.covariance, np.eye(6)[None]])
+        )
 
 
 @dataclass(frozen=True)
@@ -118,23 +132,25 @@ class _Between:
 
     stay: float
     """probability that the object simply stays"""
+    walk: Array
+    """(6, 6) of the prediction"""
     sigma: Array
-    """(6, 6) of the prediction, what localisation and the depth's bias add included"""
+    """(6, 6) of it and of what localisation and the depth's bias add to what is measured"""
 
     @classmethod
     def of(cls, a: Stage, b: Stage, model: Model, shape: Shape, noise_variance: Array) -> _Between:
         settings = model.config.prediction
         dt = max(b.time_s - a.time_s, 1e-3)
         stay = model.stay_probability(shape.source, dt) if dt > settings.significant_period_s else 1.0
-        sigma = model.prediction_covariance(dt) + np.diag(noise_variance)
-        return cls(min(stay, 1.0 - settings.jump_probability), sigma)
+        walk = model.prediction_covariance(dt)
+        return cls(min(stay, 1.0 - settings.jump_probability), walk, walk + np.diag(noise_variance))
 
 
 def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape: Shape) -> _Step:
     n, m = len(known.covariance), len(b.log_evidence)
-    log_stay = np.zeros((n, m))
-    if n and m:
-        log_stay = np.log(between.stay) + prediction.integrated_log_potential(
+    log_stay = np.full((n, m + 1), np.log(between.stay))
+    if m:
+        log_stay[:, :m] += prediction.integrated_log_potential(
             known.T_world_centre[:, None],
             known.covariance[:, None],
             b.T_world_centre[None],
@@ -145,24 +161,27 @@ def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape:
     # what did not stay is gone or elsewhere nearby, each as likely
     leave = np.log1p(-between.stay) - np.log(2.0)
     appear = leave + model.log_uniform(shape)
-    out = np.empty((n + 1, m + 1))
-    out[:n, :m] = np.logaddexp(log_stay, appear)
-    out[:n, m] = leave
-    out[n, :m] = appear
-    out[n, m] = np.log1p(-np.exp(leave))
+    out = np.full((n + 1, m + 2), -np.inf)
+    out[:n, : m + 1] = log_stay
+    out[:, :m] = np.logaddexp(out[:, :m], appear)
+    out[:n, m + 1] = leave
+    out[n, m + 1] = np.log1p(-np.exp(leave))
     return _Step(out, log_stay)
 
 
 def _update(known: _Known, b: Stage, between: _Between, log_joint: Array, shape: Shape) -> _Known:
-    """Kalman's update of the best predecessor's knowledge by each mode of b; a mode without one knows itself."""
-    if not log_joint.size:
-        return _Known(b.T_world_centre, b.covariance)
+    """The best predecessor's knowledge, by Kalman's update with each mode of b, and carried on unmeasured."""
     best = np.argmax(log_joint, axis=0)
-    T = known.T_world_centre[best]
-    before = known.covariance[best] + between.sigma
+    T, covariance = known.T_world_centre[best], known.covariance[best]
+    before = covariance[:-1] + between.sigma
     gain = before @ np.linalg.inv(before + b.covariance)
-    r = symmetry.residual(T, b.T_world_centre, shape.symmetry)
-    return _Known(se3.retract(T, (gain @ r[..., None])[..., 0]), before - gain @ before)
+    r = symmetry.residual(T[:-1], b.T_world_centre, shape.symmetry)
+    T_modes, updated = se3.retract(T[:-1], (gain @ r[..., None])[..., 0]), before - gain @ before
+    reached = np.isfinite(log_joint.max(axis=0))[:-1]
+    T_modes = np.where(reached[:, None, None], T_modes, b.T_world_centre)
+    updated = np.where(reached[:, None, None], updated, b.covariance)
+    carried = covariance[-1:] + between.walk
+    return _Known(np.concatenate([T_modes, T[-1:]]), np.concatenate([updated, carried]))
 
 
 def _moved(step: _Step, forward: Array, ahead: Array, total: float) -> float:
@@ -170,8 +189,6 @@ def _moved(step: _Step, forward: Array, ahead: Array, total: float) -> float:
     there = float(np.exp(log_sum(joint.ravel()) - total)) - float(np.exp(joint[-1, -1] - total))
     if there < 1e-9:  # it was gone before and after
         return 0.0
-    if not step.log_stay.size:
-        return 1.0
     stayed = float(np.exp(log_sum((forward[:-1, None] + step.log_stay + ahead[:-1]).ravel()) - total))
     return float(np.clip(1.0 - stayed / there, 0.0, 1.0))
 

@@ -1,6 +1,6 @@
-"""Which tracks are one object.
+"""Which objects are one.
 
-Two of one class in one place are one thing, seen on two tracks. And what left one place and what came to another may be
+Two of one class in one place are one thing. And what left one place and what came to another may be
 the same thing, moved: an object that is gone from some keyframe on and one of the same class that was not there before
 are joined by a global assignment of what vanished to what appeared.
 """
@@ -8,7 +8,6 @@ are joined by a global assignment of what vanished to what appeared.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -22,14 +21,11 @@ _SAME_CLASS = 0.5  # least P(both are of one class) for a join
 
 
 def merge_duplicates(things: Mapping[int, Thing], model: Model) -> dict[int, Thing]:
-    """Of things of one class in one place, present at one time, the one with most evidence takes the others' tracks."""
+    """Of things of one class in one place, present at one time, the one with most evidence stays."""
     kept: list[Thing] = []
     for thing in sorted(things.values(), key=lambda t: (-t.log_evidence, t.object_id)):
-        twin = next((i for i, other in enumerate(kept) if _same(other, thing, model)), None)
-        if twin is None:
+        if not any(_same(other, thing, model) for other in kept):
             kept.append(thing)
-        else:
-            kept[twin] = replace(kept[twin], tracks=(*kept[twin].tracks, *thing.tracks))
     return {thing.object_id: thing for thing in sorted(kept, key=lambda t: t.object_id)}
 
 
@@ -101,4 +97,5 @@ def _joined(a: Thing, b: Thing, recording: Recording, model: Model) -> Thing:
     sightings = {k: s for k, s in a.sightings.items() if k < begun} | {
         k: s for k, s in b.sightings.items() if k >= begun
     }
-    return judge(a.object_id, (*a.tracks, *b.tracks), sightings, recording, model)
+    boxes = {k: d for k, d in a.boxes.items() if k < begun} | {k: d for k, d in b.boxes.items() if k >= begun}
+    return judge(a.object_id, boxes, sightings, recording, model)

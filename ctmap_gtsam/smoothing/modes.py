@@ -1,8 +1,8 @@
 """Measurement modes of every object, class and keyframe, with the whole run in view.
 
-Seeding searches each track afresh at a few of its detections. Gathering then goes through the run once a round, depth
-read once a keyframe, and refines on each image what was found at other times, what the smoother predicts, and what was
-there before. Only the likelihood goes into a mode: the prior is the graph's and the trellis's business.
+Gathering goes through the run once a round, depth read once a keyframe, and refines on each image what was found at
+other times, what the smoother predicts, and what was there before. Only the likelihood goes into a mode: the prior is
+the graph's and the trellis's business.
 """
 
 from __future__ import annotations
@@ -13,27 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.frontend.association import Associator, Track
-from ctmap_gtsam.frontend.observation import Observation, observations
+from ctmap_gtsam.frontend.observation import Observation, centre_depth, observations
 from ctmap_gtsam.frontend.place import Place
-from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View, distinct
+from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.shapes import Shape
-from factors.mixture import log_sum
 from sequences.geometry import Plane
 from sequences.progress import Progress
-from sequences.seeds import generator
 from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
 
-_WORTH_A_SEARCH = 30.0
-"""nats behind the best class of the views before beyond which a class isn't searched for any more"""
-
-_KEPT = 8  # poses of a class that a track starts from, at most
-_ONE_POSE = (0.15, 0.015)  # rad, metres: what searches in several images find nearer to each other is found once
+Boxes = Mapping[int, Detection]
+"""keyframe -> the detection that is taken for an object there"""
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,8 @@ class Recording:
     """(K,) indices into Run.frames"""
     planes: tuple[tuple[Plane, ...], ...]
     """(K,) those of each keyframe's image, camera frame: found once, depth is read again each round"""
-    tracks: tuple[Track, ...]
+    box_depths: tuple[Array, ...]
+    """(K,) of (D,) depths in the middle of each keyframe's detections, metres; 0 where nothing was measured"""
     place: Place
 
     def observe(self, keyframe: int) -> Observation:
@@ -89,94 +83,26 @@ class Wanted:
     """classes whose covariance is worth probing"""
 
 
-@dataclass
-class Found:
-    """What the full searches found of one track."""
-
-    poses: dict[int, Array]
-    """class index -> (n, 4, 4) T_world_centre, all apart from each other, the best first"""
-    scores: dict[int, Array]
-    """class index -> (n,) log-likelihood of each in the view that it was found in"""
-    log_likelihood: Array
-    """(C,) of the best pose of each search, summed: what the searched views say of the class"""
-
-    def join(self, shape: Shape, poses: Array, scores: Array) -> None:
-        """Take in poses (n, 4, 4) T_world_centre of a class that one search found, with their log-likelihoods (n,)."""
-        poses = np.concatenate([self.poses[shape.index], poses])
-        scores = np.concatenate([self.scores[shape.index], scores])
-        kept = distinct(shape, poses, scores, _ONE_POSE, _KEPT)
-        self.poses[shape.index], self.scores[shape.index] = poses[kept], scores[kept]
-
-    def within(self, nats: float) -> list[int]:
-        """Classes that come so near to the best."""
-        return [int(c) for c in np.flatnonzero(self.log_likelihood >= self.log_likelihood.max() - nats)]
-
-
 def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progress) -> Recording:
-    """Associate boxes over the whole run, find the level surfaces and which way is up."""
-    associator, place = Associator(model.config.frontend, model.catalogue), Place(run)
+    """Go through the run once: level surfaces, which way is up, and how far away what was detected is."""
+    place = Place(run)
     planes: list[tuple[Plane, ...]] = []
-    with progress.stage("tracks", total=len(keyframes)) as stage:
+    depths: list[Array] = []
+    with progress.stage("place", total=len(keyframes)) as stage:
         for observation in observations(run, keyframes, model.config.seed):
-            associator.step(observation)
             place.update(observation)
             planes.append(observation.planes)
+            boxes = [np.array(d.box) for d in observation.frame.detections]
+            depths.append(np.array([centre_depth(observation.depth, box) for box in boxes]))
             stage.advance()
-    return Recording(run, keyframes, tuple(planes), associator.tracks(), place)
-
-
-def seed(recording: Recording, proposer: Proposer, progress: Progress) -> dict[int, Found]:
-    """Full searches for every track and class at a few detections, spread over the track."""
-    model = proposer.model
-    chosen = {t.track_id: _spread(t.keyframes, model.config.smoother.searches) for t in recording.tracks}
-    at = sorted({k for keyframes in chosen.values() for k in keyframes})
-    found = {
-        t.track_id: Found(
-            {s.index: np.zeros((0, 4, 4)) for s in model.shapes},
-            {s.index: np.zeros(0) for s in model.shapes},
-            np.zeros(len(model.shapes)),
-        )
-        for t in recording.tracks
-    }
-    with progress.stage("search", total=sum(map(len, chosen.values()))) as stage:
-        for k in at:
-            observation = recording.observe(k)
-            for track in recording.tracks:
-                if k not in chosen[track.track_id]:
-                    continue
-                _search(found[track.track_id], track, observation, recording.place, proposer)
-                stage.advance()
-    return found
-
-
-def _search(found: Found, track: Track, observation: Observation, place: Place, proposer: Proposer) -> None:
-    model = proposer.model
-    detection = track.at(observation.keyframe)
-    assert detection is not None
-    around = Surroundings((), place.surfaces)
-    view = proposer.view(observation, np.array(detection.box), detection, around)
-    for c in found.within(_WORTH_A_SEARCH):
-        shape = model.shapes[c]
-        stage = f"smoother.search.{shape.source.obj_id}"
-        rng = generator(model.config.seed, stage, track.track_id, observation.frame.index)
-        starts = proposer.search(shape, view, observation, around, rng, model.config.smoother.search_share)
-        modes = proposer.modes(shape, view, starts, probe=False)
-        found.join(shape, observation.frame.T_world_camera @ modes.T_camera_centre, modes.log_likelihood)
-        # a class that explains nothing here says as much as nothing being here
-        found.log_likelihood[shape.index] += max(log_evidence(modes), 0.0)
-
-
-def _spread(keyframes: tuple[int, ...], n: int) -> frozenset[int]:
-    """n of a track's keyframes, evenly spread, ends included."""
-    picks = np.unique(np.round(np.linspace(0, len(keyframes) - 1, n)).astype(int))
-    return frozenset(keyframes[i] for i in picks)
+    return Recording(run, keyframes, tuple(planes), tuple(depths), place)
 
 
 def gather(
     recording: Recording,
     proposer: Proposer,
     wanted: Callable[[int, int], Wanted | None],
-    tracks: Mapping[int, tuple[Track, ...]],
+    boxes: Mapping[int, Boxes],
     neighbours: Callable[[int, int], tuple[Neighbour, ...]],
     progress: Progress,
     name: str,
@@ -187,7 +113,7 @@ def gather(
         recording: the run.
         proposer: who refines.
         wanted: (object, keyframe) -> what to start from; None where the object isn't looked for.
-        tracks: object -> its tracks.
+        boxes: object -> its detections.
         neighbours: (object, keyframe) -> objects whose pixels are theirs.
         progress: who is told.
         name: of this round, for the progress.
@@ -195,15 +121,15 @@ def gather(
     Returns:
         object -> keyframe -> sighting.
     """
-    seen: dict[int, dict[int, Sighting]] = {i: {} for i in tracks}
+    seen: dict[int, dict[int, Sighting]] = {i: {} for i in boxes}
     last: dict[int, tuple[Array, float]] = {}
     with progress.stage(name, total=len(recording.keyframes)) as stage:
         for k in range(len(recording.keyframes)):
-            asked = {i: wish for i in tracks if (wish := wanted(i, k)) is not None}
+            asked = {i: wish for i in boxes if (wish := wanted(i, k)) is not None}
             observation = recording.observe(k) if asked else None
             for i, wish in asked.items():
                 assert observation is not None
-                detection = _detection(tracks[i], k)
+                detection = boxes[i].get(k)
                 around = Surroundings(neighbours(i, k), recording.place.surfaces)
                 sighting = _sight(observation, recording.time_s(k), proposer, wish, detection, around, last.get(i))
                 if sighting is not None:
@@ -211,11 +137,6 @@ def gather(
                     last[i] = sighting[1]
             stage.advance()
     return seen
-
-
-def _detection(tracks: tuple[Track, ...], keyframe: int) -> Detection | None:
-    found = [d for t in tracks if (d := t.at(keyframe)) is not None]
-    return found[0] if found else None
 
 
 def _sight(
@@ -274,11 +195,6 @@ def _viewpoint(wish: Wanted, observation: Observation) -> Array:
         return camera - wish.expected[1][:3, 3]
     everywhere = np.concatenate([starts[:, :3, 3] for starts in wish.starts.values()])
     return camera - np.median(everywhere, axis=0)
-
-
-def log_evidence(modes: PoseModes) -> float:
-    """log of the summed likelihood of a view's modes, nats; -inf without any."""
-    return float(log_sum(modes.log_likelihood)) if len(modes) else -np.inf
 
 
 def in_world(sighting: Sighting, c: int, T_world_camera: Array) -> Array:

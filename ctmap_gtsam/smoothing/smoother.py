@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.frontend.association import Track
-from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.smoothing.belief import LIKELY, POSSIBLE, Thing, judge
+from ctmap_gtsam.smoothing.association import Expected, associate
+from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera, Smoothed, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
-from ctmap_gtsam.smoothing.modes import Found, Recording, Sighting, Wanted, gather, in_world, record, seed
+from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, in_world, record
+from ctmap_gtsam.smoothing.seeding import Seed, seeds
 from ctmap_gtsam.smoothing.writing import write
 from factors.symmetry import residual
 from sequences.progress import SILENT, Progress
@@ -30,6 +30,7 @@ from sequences.types import Run
 
 Array = NDArray[np.float64]
 
+_LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care in the first round
 _SETTLED = (0.002, 0.0002)  # rad, metres: poses that move less from round to round have settled
 
 
@@ -46,25 +47,31 @@ class Map:
 
 
 def smooth_run(
-    run: Run, config: Config | None = None, *, context: bool = True, progress: Progress | None = None
+    run: Run, forward: Estimate, config: Config | None = None, *, progress: Progress | None = None
 ) -> Estimate:
-    """The factor-graph smoother over a run.
+    """The factor-graph smoother over a run, from the hypotheses of a forward pass.
 
     Args:
         run: from `sequences.bop.load_run`.
+        forward: what a filter says of the run; it names objects, classes and poses to begin with, and nothing else.
+            With a T-Map's the smoother knows nothing of relations between objects either.
         config: settings; None = the defaults.
-        context: False for the smoother of T-Map, which knows nothing of relations between objects.
         progress: who is told how far it is.
 
     Returns:
-        The estimate p(o_t | z_1:T) at every keyframe.
+        The estimate p(o_t | z_1:T) at the forward pass's keyframes.
+
+    Raises:
+        ValueError: `forward` is of another run.
     """
+    if forward.meta.get("fingerprint") != run.fingerprint:
+        raise ValueError(f"the forward pass is of another run than {run.name}")
     config = config or Config()
     told = progress or SILENT
-    model = Model(run.catalogue, config, context=context)
+    model = Model(run.catalogue, config, context=not str(forward.meta["method"]).endswith("-t"))
     proposer = Proposer(model)
-    recording = record(run, select_keyframes(run, config.keyframes), model, told)
-    current = _first_round(recording, proposer, told)
+    recording = record(run, forward.keyframe_frame, model, told)
+    current = _first_round(recording, proposer, seeds(forward, model), told)
     energies = [dict(current.energy)]
     for number in range(config.smoother.rounds):
         following = _next_round(recording, proposer, current, told, f"round {number + 2}")
@@ -76,27 +83,33 @@ def smooth_run(
     return write(recording, model, current.things, current.smoothed, _diagnostics(proposer, current, energies))
 
 
-def _first_round(recording: Recording, proposer: Proposer, progress: Progress) -> Map:
-    """Every track is an object; it starts from what full searches found of it."""
-    found = seed(recording, proposer, progress)
-    wishes = {i: _wish(f) for i, f in found.items()}
-    tracks = {t.track_id: (t,) for t in recording.tracks}
-    sightings = gather(recording, proposer, lambda i, _: wishes[i], tracks, lambda _i, _k: (), progress, "round 1")
-    return _solve(recording, proposer.model, tracks, sightings)
+def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, Seed], progress: Progress) -> Map:
+    """Every object of the forward pass starts from all poses that it ever was believed to have."""
+    model = proposer.model
 
+    def expected(i: int, k: int) -> Expected:
+        return Expected(seeds[i].best_class, seeds[i].expected(k), seeds[i].class_probability, 1.0)
 
-def _wish(found: Found) -> Wanted:
-    """All that the searches found of the classes that are still possible."""
-    best = int(np.argmax(found.log_likelihood))
-    starts = {c: found.poses[c] for c in found.within(POSSIBLE)}
-    expected = (best, found.poses[best][0]) if len(found.poses[best]) else None
-    return Wanted(starts, expected, frozenset(found.within(LIKELY)))
+    def wanted(i: int, k: int) -> Wanted:
+        likely = frozenset(c for c in seeds[i].poses if seeds[i].class_probability[c] > _LIKELY)
+        return Wanted(seeds[i].poses, (seeds[i].best_class, seeds[i].expected(k)), likely | {seeds[i].best_class})
+
+    boxes = associate(recording, model, seeds, expected)
+    sightings = gather(recording, proposer, wanted, boxes, lambda _i, _k: (), progress, "round 1")
+    return _solve(recording, model, boxes, sightings)
 
 
 def _next_round(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Map:
     """Start from the smoothed map; every object's background is the map of the others."""
     model = proposer.model
-    tracks = {i: thing.tracks for i, thing in current.things.items()}
+
+    def expected(i: int, k: int) -> Expected | None:
+        thing = current.things[i]
+        pose = thing.pose_near(thing.best_class, k)
+        if pose is None:
+            return None
+        there = thing.solid * thing.presence_at(k)
+        return Expected(thing.best_class, pose[0], thing.class_probability, there)
 
     def wanted(i: int, k: int) -> Wanted | None:
         thing = current.things[i]
@@ -118,8 +131,9 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
         there = [_neighbour(thing, k, model) for thing in current.things.values()]
         return Surroundings(tuple(n for n in there if n is not None), ()).without(i).neighbours
 
-    sightings = gather(recording, proposer, wanted, tracks, neighbours, progress, name)
-    return _solve(recording, model, tracks, sightings)
+    boxes = associate(recording, model, current.things, expected)
+    sightings = gather(recording, proposer, wanted, boxes, neighbours, progress, name)
+    return _solve(recording, model, boxes, sightings)
 
 
 def _neighbour(thing: Thing, keyframe: int, model: Model) -> Neighbour | None:
@@ -133,11 +147,11 @@ def _neighbour(thing: Thing, keyframe: int, model: Model) -> Neighbour | None:
 def _solve(
     recording: Recording,
     model: Model,
-    tracks: Mapping[int, tuple[Track, ...]],
+    boxes: Mapping[int, Boxes],
     sightings: Mapping[int, Mapping[int, Sighting]],
 ) -> Map:
     """Trellis for every object, identities over gaps, then one graph."""
-    things = {i: judge(i, tracks[i], sightings[i], recording, model) for i in tracks if sightings[i]}
+    things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, model), recording, model)
     cameras = [
         Camera(recording.T_world_camera(k), recording.time_s(k), recording.run.frames[int(f)].visit)

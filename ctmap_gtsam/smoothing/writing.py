@@ -101,7 +101,7 @@ def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
     c = thing.reported_class
     for k, stage, state in zip(thing.keyframes, thing.stages[c], thing.posteriors[c].path, strict=True):
         modes = thing.sightings[k].modes[c]
-        if modes is None or state == len(stage.log_evidence):
+        if modes is None or state >= len(stage.log_evidence):
             continue
         depth = float(modes.depth_log_ratio[state])
         tables.note(row, k, "depth", depth)

@@ -21,7 +21,7 @@ from sequences.types import Detection, Frame, LocalisationNoise, Run, Visit
 
 CAMERA = Camera(285.0, 285.0, 159.5, 119.5, 320, 240)
 UP = np.array([0.0, 0.0, 1.0])
-CHEAP = ("frontend.fresh_poses=100", "frontend.refined_poses=8", "filter.particles=60", "smoother.searches=2")
+CHEAP = ("frontend.fresh_poses=100", "frontend.refined_poses=8", "filter.particles=60")
 """settings with which estimators are quick and still themselves"""
 
 

@@ -17,7 +17,9 @@ from factors.persistence import stay_probability
 from sequences import se3
 from tests.ctmap_gtsam.scenes import classes, config_of
 
-MODEL = Model(classes("mug"), config_of("prediction.rotation_rate=0.2", "prediction.translation_rate=0.05"))
+WALKING = ("prediction.rotation_rate=0.2", "prediction.translation_rate=0.05")
+MODEL = Model(classes("mug"), config_of(*WALKING, "smoother.unmeasured=0.0"))
+"""without the unmeasured, every state is what is known of the past: paths can be enumerated"""
 MUG = MODEL.shapes[0]
 USUAL = Model(classes("mug"), config_of())
 STILL = np.full(6, 1e-18)
@@ -68,6 +70,11 @@ def log_steps(stages, model, shape):
     return start, emissions, steps, stays
 
 
+def without_unmeasured(path, stages):
+    """The path with gone numbered after the modes."""
+    return tuple(min(s, len(stage.log_evidence)) for s, stage in zip(path, stages, strict=True))
+
+
 def all_paths(start, emissions, steps):
     """Every path with its log weight."""
     for path in product(*(range(len(e)) for e in emissions)):
@@ -76,7 +83,7 @@ def all_paths(start, emissions, steps):
 
 
 @settings(max_examples=12)
-@given(st.integers(0, 2**31), st.lists(st.integers(0, 3), min_size=1, max_size=4))
+@given(st.integers(0, 2**31), st.lists(st.integers(1, 3), min_size=1, max_size=4))
 def test_the_trellis_sums_over_all_paths(seed, sizes):
     rng = np.random.default_rng(seed)
     stages = random_stages(rng, sizes)
@@ -87,11 +94,12 @@ def test_the_trellis_sums_over_all_paths(seed, sizes):
     assert posterior.log_evidence == pytest.approx(total, abs=1e-3)
     share = np.exp(np.array(weights) - total)
     for k, marginal in enumerate(posterior.modes):
-        expected = np.bincount([p[k] for p in paths], share, minlength=len(marginal))
-        np.testing.assert_allclose(marginal, expected, atol=1e-3)
+        expected = np.bincount([p[k] for p in paths], share, minlength=len(marginal) - 1)
+        np.testing.assert_allclose(np.delete(marginal, -2), expected, atol=1e-3)
+        assert marginal[-2] == 0.0
     ordered = np.sort(weights)
     if len(ordered) == 1 or ordered[-1] - ordered[-2] > 1e-2:
-        assert posterior.path == paths[int(np.argmax(weights))]
+        assert without_unmeasured(posterior.path, stages) == paths[int(np.argmax(weights))]
     for k, (step, stay) in enumerate(zip(steps, stays, strict=True)):
         n, m = stay.shape
         either = sum(w for p, w in zip(paths, share, strict=True) if p[k] < n or p[k + 1] < m)
@@ -106,29 +114,24 @@ def test_the_trellis_sums_over_all_paths(seed, sizes):
 
 def test_marginals_and_best_path_are_those_of_gtsam():
     rng = np.random.default_rng(4)
-    stages = random_stages(rng, (2, 3, 1, 0, 2, 3))
+    stages = random_stages(rng, (2, 3, 1, 2, 3))
     start, emissions, steps, _ = log_steps(stages, MODEL, MUG)
-    # GTSAM has no variable with a single value: a stage without modes gets a second state of no weight
-    pad = [max(2 - len(e), 0) for e in emissions]
-    graph, keys = (
-        gtsam.DiscreteFactorGraph(),
-        [(k, len(e) + p) for k, (e, p) in enumerate(zip(emissions, pad, strict=True))],
-    )
+    graph, keys = gtsam.DiscreteFactorGraph(), [(k, len(e)) for k, e in enumerate(emissions)]
 
     def table(logs):
         return list(np.exp(logs - logs.max()).ravel())
 
     graph.add(keys[0], table(start))
-    for key, emission, p in zip(keys, emissions, pad, strict=True):
-        graph.add(key, table(np.append(emission, np.full(p, -np.inf))))
-    for a, b, step, p, q in zip(keys, keys[1:], steps, pad, pad[1:], strict=False):
-        graph.add([a, b], table(np.pad(step, ((0, p), (0, q)), constant_values=-np.inf)))
+    for key, emission in zip(keys, emissions, strict=True):
+        graph.add(key, table(emission))
+    for a, b, step in zip(keys, keys[1:], steps, strict=False):
+        graph.add([a, b], table(step))
     marginals, best = gtsam.DiscreteMarginals(graph), graph.optimize()
     posterior = solve(stages, MODEL, MUG, STILL)
     for key, marginal in zip(keys, posterior.modes, strict=True):
-        expected = marginals.marginalProbabilities(key)[: len(marginal)]
-        np.testing.assert_allclose(marginal, expected, atol=1e-3)
-    assert posterior.path == tuple(best[k] for k, _ in keys)
+        expected = marginals.marginalProbabilities(key)[: len(marginal) - 1]
+        np.testing.assert_allclose(np.delete(marginal, -2), expected, atol=1e-3)
+    assert without_unmeasured(posterior.path, stages) == tuple(best[k] for k, _ in keys)
 
 
 def vague_track(rng, n, sigma=0.004):
@@ -145,7 +148,8 @@ def vague_track(rng, n, sigma=0.004):
 
 def test_evidence_of_a_track_is_the_integral_over_its_poses():
     """Law 7 of the model: with one mode a stage it is Kalman's evidence, however vague the single views are."""
-    config = config_of("prediction.rotation_rate=1e-6", "prediction.jump_probability=1e-15")
+    still = ("prediction.rotation_rate=1e-6", "prediction.jump_probability=1e-15", "smoother.unmeasured=0.0")
+    config = config_of(*still)
     model = Model(classes("mug"), config)
     rng = np.random.default_rng(2)
     stages, shape = vague_track(rng, 9), model.shapes[0]
@@ -216,7 +220,7 @@ def test_a_place_seen_empty_says_from_when_on_it_was_gone():
     empty = -60.0  # a pose that should show and doesn't
     stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), at(2, 86400.0, 0.0, empty), at(3, 86401.0, 0.0, empty)]
     posterior = solve(stages, USUAL, MUG, STILL)
-    assert posterior.path == (0, 0, 1, 1)
+    assert posterior.path == (0, 0, 2, 2)
     assert [m[-1] > 0.99 for m in posterior.modes] == [False, False, True, True]
 
 
@@ -226,7 +230,43 @@ def test_a_moment_hidden_is_not_an_absence():
     stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), flat, at(3, 3.0, 0.0), at(4, 4.0, 0.0)]
     posterior = solve(stages, USUAL, MUG, STILL)
     assert posterior.path == (0, 0, 0, 0, 0)
-    assert posterior.modes[2][0] > 0.99
+    assert posterior.modes[2][-1] < 0.01
+
+
+@pytest.mark.parametrize("wrong", [0.03, 0.5])
+def test_a_view_that_is_misread_is_no_move(wrong):
+    """One view in the middle has its only mode elsewhere, and explains it far better than its neighbours theirs."""
+    stages = [at(k, float(k), 0.0) for k in range(4)] + [at(4, 4.0, wrong, 100.0)]
+    stages += [at(k, float(k), 0.0) for k in range(5, 9)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0, 0, 0, 0, 1, 0, 0, 0, 0)
+    assert (posterior.moved < 0.01).all()
+    assert all(m[-1] < 0.01 for m in posterior.modes)
+
+
+def test_what_is_seen_elsewhere_from_some_view_on_has_moved_there():
+    stages = [at(k, float(k), 0.0) for k in range(5)] + [at(k, float(k), 0.1) for k in range(5, 10)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0,) * 10
+    np.testing.assert_allclose(posterior.moved, np.arange(9) == 4, atol=0.01)
+
+
+def test_a_view_without_modes_leaves_it_where_it_was():
+    nothing = Stage(2, 2.0, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0))
+    stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), nothing, at(3, 3.0, 0.0), at(4, 4.0, 0.0)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    assert posterior.path == (0, 0, 0, 0, 0)
+    assert posterior.modes[2][0] == pytest.approx(1.0)
+    assert (posterior.moved < 0.01).all()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**31), st.lists(st.integers(0, 3), min_size=2, max_size=6))
+def test_probabilities_sum_to_one_with_the_unmeasured_too(seed, sizes):
+    posterior = solve(random_stages(np.random.default_rng(seed), sizes), USUAL, MUG, np.full(6, 1e-6))
+    for marginal in posterior.modes:
+        assert marginal.sum() == pytest.approx(1.0)
+    assert ((posterior.moved >= 0.0) & (posterior.moved <= 1.0)).all()
 
 
 def test_an_object_that_cant_be_moved_stays_however_long_nobody_looks():

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.smoothing.smoother import smooth_run
 from factors.symmetry import Symmetry, residual
 from tests.ctmap_gtsam.scenes import CHEAP, config_of, small_run
 
 CONFIG = config_of(*CHEAP)
+
+
+def smoothed(run, config=None, context=True) -> Estimate:
+    """The smoother after the filter that it begins with."""
+    return smooth_run(run, filter_run(run, config, context=context), config)
 
 
 def row_of(estimate, truth, name, k=-1):
@@ -25,12 +31,12 @@ def scene():
 
 @pytest.fixture(scope="module")
 def estimate(scene) -> Estimate:
-    return smooth_run(scene[0], CONFIG)
+    return smoothed(scene[0], CONFIG)
 
 
 def test_what_stands_there_is_found_at_every_keyframe(scene):
     run, truth = scene
-    estimate = smooth_run(run)
+    estimate = smoothed(run)
     assert len(estimate.object_id) == len(truth)
     for name, T in truth.items():
         source = next(c for c in run.catalogue.classes if c.name == name)
@@ -43,7 +49,7 @@ def test_what_stands_there_is_found_at_every_keyframe(scene):
 
 
 def test_the_same_seed_gives_the_same_bytes(scene, estimate, tmp_path):
-    for name, some in (("a", estimate), ("b", smooth_run(scene[0], CONFIG))):
+    for name, some in (("a", estimate), ("b", smoothed(scene[0], CONFIG))):
         some.save(tmp_path / f"{name}.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
@@ -74,7 +80,7 @@ def test_mixtures_are_normalised_and_covariances_proper(estimate):
 
 def test_what_was_taken_away_was_there_before_and_not_after():
     run, truth = small_run(frames=8, there=lambda k, name: name != "mug" or k < 4)
-    estimate = smooth_run(run, CONFIG)
+    estimate = smoothed(run, CONFIG)
     mug, can = row_of(estimate, truth, "mug", 0), row_of(estimate, truth, "soup_can", 0)
     assert (estimate.existence[mug, :4] > 0.9).all()
     assert (estimate.existence[mug, 5:] < 0.5).all()
@@ -84,7 +90,7 @@ def test_what_was_taken_away_was_there_before_and_not_after():
 def test_a_thing_is_known_from_the_frames_that_found_it_where_the_detector_missed_it():
     """Hindsight: the detector finds the mug from the third frame on, the smoother has it in the first."""
     run, truth = small_run(frames=7, seen=lambda k, name: name != "mug" or k > 1)
-    estimate = smooth_run(run, CONFIG)
+    estimate = smoothed(run, CONFIG)
     mug = row_of(estimate, truth, "mug")
     assert (estimate.existence[mug] > 0.9).all()
     assert np.linalg.norm(np.ptp(estimate.pose[mug, :, :3, 3], axis=0)) < 0.005
@@ -92,7 +98,7 @@ def test_a_thing_is_known_from_the_frames_that_found_it_where_the_detector_misse
 
 def test_a_thing_that_was_not_moved_between_visits_is_one_object():
     run, truth = small_run(frames=4, visits=2)
-    estimate = smooth_run(run, CONFIG)
+    estimate = smoothed(run, CONFIG)
     assert len(estimate.object_id) == len(truth)
     assert (estimate.existence > 0.9).all()
     between = estimate.moves.gap[:, 0] == 3
@@ -101,7 +107,7 @@ def test_a_thing_that_was_not_moved_between_visits_is_one_object():
 
 def test_a_thing_that_was_moved_between_visits_is_one_object_that_moved():
     run, truth = small_run(frames=4, visits=2, moved={"mug": (0.02, 0.2)})
-    estimate = smooth_run(run, CONFIG)
+    estimate = smoothed(run, CONFIG)
     assert len(estimate.object_id) == len(truth)
     assert (estimate.existence > 0.9).all()
     mug = row_of(estimate, truth, "mug", 0)
@@ -123,7 +129,7 @@ def test_a_single_lying_score_vector_changes_nothing(scene):
         return replace(frame, detections=tuple(replace(d, class_scores=lie) for d in frame.detections))
 
     visits = tuple(replace(v, frames=tuple(swapped(f) for f in v.frames)) for v in run.visits)
-    estimate = smooth_run(replace(run, visits=visits), CONFIG)
+    estimate = smoothed(replace(run, visits=visits), CONFIG)
     for name in truth:
         source = next(c for c in run.catalogue.classes if c.name == name)
         assert (estimate.best_class[row_of(estimate, truth, name)] == source.obj_id).all()
@@ -131,12 +137,30 @@ def test_a_single_lying_score_vector_changes_nothing(scene):
 
 def test_without_boxes_there_is_nothing_but_the_camera():
     run, _ = small_run(frames=3, seen=lambda k, name: False)
-    estimate = smooth_run(run, CONFIG)
+    estimate = smoothed(run, CONFIG)
     assert len(estimate.object_id) == 0
     np.testing.assert_allclose(estimate.T_world_camera, [f.T_world_camera for f in run.frames], atol=1e-9)
 
 
 def test_t_map_has_no_context_factors(scene):
-    estimate = smooth_run(scene[0], CONFIG, context=False)
+    estimate = smoothed(scene[0], CONFIG, context=False)
     assert estimate.meta["method"] == "smooth-t"
     assert "context" not in estimate.meta["diagnostics"]["factors"]
+
+
+def test_hypotheses_of_the_forward_pass_go_in_and_nothing_else(scene, tmp_path):
+    """How sure it was, where of and for what reason isn't used: the same data would be counted twice."""
+    run, _ = scene
+    forward = filter_run(run, CONFIG)
+    modes = replace(forward.modes, covariance=100.0 * forward.modes.covariance)
+    ledger = replace(forward.ledger, nats=-forward.ledger.nats)
+    other = replace(forward, modes=modes, ledger=ledger, existence=np.full_like(forward.existence, 0.3))
+    for name, start in (("a", forward), ("b", other)):
+        smooth_run(run, start, CONFIG).save(tmp_path / f"{name}.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_forward_pass_of_another_run_is_refused(scene):
+    other = replace(scene[0], fingerprint="of other images")
+    with pytest.raises(ValueError, match="another run"):
+        smooth_run(scene[0], filter_run(other, CONFIG), CONFIG)
