@@ -56,7 +56,7 @@ class Posterior:
     path: tuple[int, ...]
     """the most probable states; n stands for unmeasured, n + 1 for gone"""
     moved: Array
-    """(stages - 1,) probability that the object did not simply stay between two stages, given it was there at either"""
+    """(stages - 1,) probability that the object was there at either of two stages and did not simply stay"""
 
 
 def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: Array) -> Posterior:
@@ -185,12 +185,11 @@ def _update(known: _Known, b: Stage, between: _Between, log_joint: Array, shape:
 
 
 def _moved(step: _Step, forward: Array, ahead: Array, total: float) -> float:
+    """P(there before or after, and not simply stayed)."""
     joint = forward[:, None] + step.log_total + ahead
-    there = float(np.exp(log_sum(joint.ravel()) - total)) - float(np.exp(joint[-1, -1] - total))
-    if there < 1e-9:  # it was gone before and after
-        return 0.0
-    stayed = float(np.exp(log_sum((forward[:-1, None] + step.log_stay + ahead[:-1]).ravel()) - total))
-    return float(np.clip(1.0 - stayed / there, 0.0, 1.0))
+    gone = np.exp(joint[-1, -1] - total)
+    stayed = np.exp(log_sum((forward[:-1, None] + step.log_stay + ahead[:-1]).ravel()) - total)
+    return float(np.clip(1.0 - gone - stayed, 0.0, 1.0))
 
 
 def _viterbi(start: Array, emissions: list[Array], steps: list[_Step]) -> tuple[int, ...]:
