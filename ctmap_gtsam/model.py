@@ -26,6 +26,8 @@ from sequences.types import Detection, LocalisationNoise
 
 Array = NDArray[np.float64]
 
+_EDGES = 4.0  # of a box
+
 
 def localisation_variance(noise: LocalisationNoise, away_m: float) -> tuple[float, float]:
     """By how much localisation turns (rad^2) and moves (m^2) what a camera sees at a distance; its turn moves, too."""
@@ -120,12 +122,14 @@ class Model:
 
         A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1).
         """
-        visible = np.divide(scores.visible, scores.covered, out=np.zeros_like(scores.visible), where=scores.covered > 0)
+        return self.kappa * scores.log_ratio + self._detection(scores, detection, image_size)
+
+    def _detection(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
         boxes = None
         if detection is not None:
             rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
             boxes = self.box(np.array(detection.box), rendered, image_size)
-        return self.kappa * scores.log_ratio + self.detection(visible, boxes)
+        return self.detection(_shares(scores), boxes)
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
@@ -151,27 +155,64 @@ class Model:
         """(C,) log evidence of the true class c from class_scores (C,) summed over a track and visit: saturating."""
         return persistent_class_log_evidence(summed, self.log_confusion)
 
+    def clutter_detection(self, visible: Array, detection: Detection | None, image_size: tuple[int, int]) -> Array:
+        """log of the detection potential (K,) of something that no mesh explains, of which shares (K,) are visible.
+
+        Its boxes come less often than a known thing's, and jitter, too, about one that nobody knows: a nat is what an
+        edge of Laplace's density expects to lose.
+        """
+        rate = self.config.detector.clutter_rate
+        if detection is None:
+            return np.log1p(-rate * visible)
+        box = np.array(detection.box)
+        return np.full(len(visible), np.log(rate) + float(self.box(box, box[None], image_size)[0]) - _EDGES)
+
+    def witness(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
+        """What a box, or that there is none, says (K,) for a known thing at poses (K,) against a look-alike, nats.
+
+        Args:
+            scores: of the poses.
+            detection: the track's box in this view; None where it has none.
+            image_size: width and height, pixels.
+        """
+        known = self._detection(scores, detection, image_size)
+        return known - self.clutter_detection(_shares(scores), detection, image_size)
+
     def existence(
-        self, log_evidence: Array, score_evidence: Array, log_clutter: float, *log_rivals: float
+        self,
+        log_evidence: Array,
+        score_evidence: Array,
+        log_clutter: float,
+        witness: float,
+        *log_rivals: float,
     ) -> tuple[float, Array]:
         """P(a track is a known thing), and its class.
 
         That no pose explains more than clutter would may be the search's fault: a part of such tracks are known things
-        all the same (`detector.unfound`), of the class that the scores say.
+        all the same (`detector.unfound`), of the class that the scores say. That a pose explains the depth however well
+        may be because of a thing of unknown mesh that looks alike (`detector.lookalike`): between the two the detector
+        decides, which finds known things in most views.
 
         Args:
             log_evidence: (C,) of each class at the poses that were found, scores and context included; -inf for none.
             score_evidence: (C,) the scores' part of it; -inf for classes that have no pose.
             log_clutter: log evidence of something that no mesh explains.
+            witness: what all boxes and their absences say for the most probable class, see `witness`.
             log_rivals: of what else it may be.
 
         Returns:
             P(exists) and P(class | exists) (C,).
         """
         found = mixture.log_sum(log_evidence)
-        p_found, p_clutter, *_ = np.exp(mixture.normalised(np.array([found, log_clutter, *log_rivals])))
+        alike = found + float(np.log(self.config.detector.lookalike)) - witness
+        p_found, p_clutter, *_ = np.exp(mixture.normalised(np.array([found, log_clutter, alike, *log_rivals])))
         by_pose, by_scores = np.exp(mixture.normalised(log_evidence)), np.exp(mixture.normalised(score_evidence))
         unfound = self.config.detector.unfound if np.isfinite(score_evidence).any() else 0.0
         each = p_found * by_pose + unfound * p_clutter * by_scores
         total = float(each.sum())
         return total, each / total if total > 0.0 else by_pose
+
+
+def _shares(scores: Scores) -> Array:
+    """(K,) of each silhouette that is visible; 0 out of view."""
+    return np.divide(scores.visible, scores.covered, out=np.zeros_like(scores.visible), where=scores.covered > 0)

@@ -65,6 +65,8 @@ class Belief:
     """(C,) log evidence of the visits before"""
     log_clutter: float
     """log evidence of something that no mesh explains"""
+    witness: float
+    """what its boxes and their absences say for a known thing against a look-alike, nats"""
     log_elsewhere: float
     """log evidence of having been moved to where nobody looked"""
     visit: int
@@ -198,6 +200,7 @@ class Updater:
             score_sum=score_sum,
             score_evidence=np.zeros(n),
             log_clutter=0.0,
+            witness=0.0,
             log_elsewhere=-np.inf,
             visit=observation.frame.visit,
             first_ns=observation.frame.time_ns,
@@ -209,7 +212,7 @@ class Updater:
         )
         memory = Memory().joined(view, observation.frame.T_camera_world)
         fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation), memory=memory)
-        return replace(fresh, log_clutter=self._clutter(fresh, view, observation))
+        return self._rivalled(fresh, view, observation)
 
     def _first_view(self, track: Track, observation: Observation, around: Surroundings) -> View:
         detection = track.at(observation.keyframe)
@@ -244,7 +247,7 @@ class Updater:
             searched=belief.steps if search else belief.searched,
             memory=belief.memory.joined(view, observation.frame.T_camera_world),
         )
-        return replace(moved, log_clutter=belief.log_clutter + self._clutter(moved, view, observation))
+        return self._rivalled(moved, view, observation)
 
     def report(self, belief: Belief, around: Surroundings) -> Reported:
         """The posterior, the context multiplied in once."""
@@ -264,7 +267,7 @@ class Updater:
         there = float(log_sum(log_evidence + context))
         scores = belief.score_evidence + self.model.class_evidence(belief.score_sum)
         posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
-        rivals = (belief.log_clutter, 0.0, belief.log_elsewhere)
+        rivals = (belief.log_clutter, belief.witness, 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
         # particles are what views of this camera agree on; that the camera itself is elsewhere they can't know
         shared = np.diag(self.model.shared_variance(self.localisation, float(np.linalg.norm(belief.viewpoint))))
@@ -510,14 +513,18 @@ class Updater:
         poses = observation.frame.T_world_camera @ modes.T_camera_centre
         return Gaussians(poses, _INFLATION * modes.covariance, weight)
 
-    def _clutter(self, belief: Belief, view: View, observation: Observation) -> float:
-        """What this keyframe says for something that no mesh explains, where the best hypothesis stands, nats."""
+    def _rivalled(self, belief: Belief, view: View, observation: Observation) -> Belief:
+        """With what this keyframe says for things of unknown mesh, where the best hypothesis stands."""
         best = int(np.argmax(belief.class_log_evidence(self.model)))
         own = belief.classes[best]
         if own is None:
-            return 0.0
-        T = observation.frame.T_camera_world @ own.particles.best(1)[0]
-        return self.proposer.log_clutter(self.model.shapes[best], view, T)
+            return belief
+        shape, T = self.model.shapes[best], observation.frame.T_camera_world @ own.particles.best(1)[0]
+        return replace(
+            belief,
+            log_clutter=belief.log_clutter + self.proposer.log_clutter(shape, view, T),
+            witness=belief.witness + self.proposer.witness(shape, view, T),
+        )
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)

@@ -41,7 +41,6 @@ _LARGE_SAMPLES = 0.25  # of the configured samples, as many as tell where furnit
 _UNLIKE = 0.4  # sizes of which one is less than this share of the other don't belong together
 _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
-_EDGES = 4.0  # of a box
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
@@ -80,6 +79,8 @@ class PoseModes:
     """(n,) the depth's part of it"""
     covariance: Array
     """(n, 6, 6) of the right tangent, from the score's own shape"""
+    witness: Array
+    """(n,) what the view's box or its absence says for a known thing there against a look-alike, nats"""
 
     def __len__(self) -> int:
         return len(self.log_likelihood)
@@ -207,7 +208,15 @@ class Proposer:
             keep = self._distinct(shape, candidates, score)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe)
-        return PoseModes(poses, score[keep], view.share * self.model.kappa * scores.log_ratio[keep], covariance)
+        depth = view.share * self.model.kappa * scores.log_ratio[keep]
+        return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
+
+    def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
+        """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
+        return float(self._witness(view, self.score(shape, view, T_camera_centre[None])[1])[0])
+
+    def _witness(self, view: View, scores: Scores) -> Array:
+        return view.share * self.model.witness(scores, view.detection, view.image_size)
 
     def near(self, shape: Shape, view: View, T_camera_centre: Array, reach: Array) -> float:
         """The best log-likelihood of a view about one pose (4, 4): there, or where depth draws it, if that is in reach.
@@ -231,22 +240,20 @@ class Proposer:
         the depth already; its boxes come less often, and fit as well. It has gone where most of the silhouette is seen
         through.
         """
-        detector, sensor = self.model.config.detector, self.model.config.sensor
+        sensor = self.model.config.sensor
         rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
         z, background = view.tile.depth, view.tile.background
         measured = (rendered > 0) & (z > 0)
         seen = measured & (z > rendered - sensor.occlusion_margin_m)
         sample = view.samples * self.model.kappa * sensor.clutter_gain
+        visible = np.array([seen.sum() / max(int(measured.sum()), 1)])
+        boxes = float(self.model.clutter_detection(visible, view.detection, view.image_size)[0])
         if view.detection is None:
             through = measured & (z > rendered + sensor.occlusion_margin_m)
             empty = float(max(2 * int(through.sum()) - int(measured.sum()), 0))
-            return view.share * (float(np.log1p(-detector.clutter_rate)) - sample * empty)
+            return view.share * (boxes - sample * empty)
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        gain = sample * float((seen & surprising).sum())
-        box = np.array(view.detection.box)
-        # its boxes jitter, too, about one that nobody knows: a nat is what an edge of Laplace's density expects to lose
-        matched = float(self.model.box(box, box[None], view.image_size)[0]) - _EDGES
-        return view.share * (gain + float(np.log(detector.clutter_rate)) + matched)
+        return view.share * (boxes + sample * float((seen & surprising).sum()))
 
     def _draw(
         self,
@@ -436,4 +443,4 @@ def _widths(drop: Array) -> Array:
 
 
 def _no_modes() -> PoseModes:
-    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)))
+    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros(0))

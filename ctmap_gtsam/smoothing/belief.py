@@ -219,8 +219,20 @@ def judge(
     clutter = float(sum(s.log_clutter for s in sightings.values()))
     log_evidence = evidence + scores - np.log(len(model.shapes))
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
-    posterior = model.existence(log_evidence, posed, clutter, 0.0)
+    best = int(np.argmax(log_evidence))
+    witness = _witness(stages[best], posteriors[best], sightings, best) if best in stages else 0.0
+    posterior = model.existence(log_evidence, posed, clutter, witness, 0.0)
     return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior)
+
+
+def _witness(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping[int, Sighting], c: int) -> float:
+    """What boxes and their absences say along the best path of a class, where it was measured, nats."""
+    total = 0.0
+    for stage, state in zip(stages, posterior.path, strict=True):
+        modes = sightings[stage.keyframe].modes[c]
+        if modes is not None and state < len(modes):
+            total += float(modes.witness[state])
+    return total
 
 
 def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:

@@ -5,18 +5,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sequences.types import LocalisationNoise
+from ctmap_gtsam.frontend.scoring import Scores
+from sequences.types import Detection, LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
 
 MODEL = model_of("mug", "soup_can", "cereal_box")
 UNFOUND = MODEL.config.detector.unfound
+SEEN = 60.0
+"""nats: found in most views, so that it is no look-alike"""
 nats = st.floats(-500.0, 500.0)
 three = st.lists(nats, min_size=3, max_size=3).map(np.array)
 
 
 @given(three, three, nats, nats)
 def test_existence_and_classes_are_probabilities(evidence, scores, clutter, rival):
-    exists, classes = MODEL.existence(evidence, scores, clutter, rival)
+    exists, classes = MODEL.existence(evidence, scores, clutter, SEEN, rival)
     assert 0.0 <= exists <= 1.0 + 1e-12
     assert classes.sum() == pytest.approx(1.0)
     assert (classes >= 0.0).all()
@@ -24,8 +27,8 @@ def test_existence_and_classes_are_probabilities(evidence, scores, clutter, riva
 
 @given(three, three, nats, nats, st.permutations(range(3)))
 def test_classes_have_no_order(evidence, scores, clutter, rival, order):
-    exists, classes = MODEL.existence(evidence, scores, clutter, rival)
-    again, permuted = MODEL.existence(evidence[order], scores[order], clutter, rival)
+    exists, classes = MODEL.existence(evidence, scores, clutter, SEEN, rival)
+    again, permuted = MODEL.existence(evidence[order], scores[order], clutter, SEEN, rival)
     assert again == pytest.approx(exists)
     np.testing.assert_allclose(permuted, classes[order], atol=1e-9)
 
@@ -33,7 +36,7 @@ def test_classes_have_no_order(evidence, scores, clutter, rival, order):
 @given(three, nats)
 def test_what_poses_explain_well_exists_whatever_the_scores_say(scores, clutter):
     evidence = clutter + np.array([0.0, 60.0, 20.0])
-    exists, classes = MODEL.existence(evidence, scores, clutter, clutter)
+    exists, classes = MODEL.existence(evidence, scores, clutter, SEEN, clutter)
     assert exists == pytest.approx(1.0)
     assert np.argmax(classes) == 1
 
@@ -41,18 +44,37 @@ def test_what_poses_explain_well_exists_whatever_the_scores_say(scores, clutter)
 @given(three)
 def test_what_no_pose_explains_may_still_be_what_the_detector_says(evidence):
     scores = np.array([1.0, 3.0, -2.0])
-    exists, classes = MODEL.existence(evidence, scores, evidence.max() + 60.0, 0.0)
+    exists, classes = MODEL.existence(evidence, scores, evidence.max() + 60.0, SEEN, 0.0)
     assert exists == pytest.approx(UNFOUND, abs=1e-9) or evidence.max() + 60.0 < 30.0
     np.testing.assert_allclose(classes, np.exp(scores) / np.exp(scores).sum(), atol=1e-6)
 
 
 def test_where_nothing_is_nothing_exists_and_without_poses_neither():
-    exists, _ = MODEL.existence(np.full(3, -80.0), np.zeros(3), -50.0, 0.0)
+    exists, _ = MODEL.existence(np.full(3, -80.0), np.zeros(3), -50.0, SEEN, 0.0)
     assert exists < 1e-12
     nowhere = np.full(3, -np.inf)
-    exists, classes = MODEL.existence(nowhere, nowhere, 50.0, 0.0)
+    exists, classes = MODEL.existence(nowhere, nowhere, 50.0, SEEN, 0.0)
     assert exists == 0.0
     assert classes.sum() == pytest.approx(1.0)
+
+
+@given(st.floats(10.0, 1e5), st.floats(-30.0, 30.0))
+def test_between_a_thing_and_its_look_alike_the_detector_decides_however_well_a_pose_explains(evidence, witness):
+    """Depth can't tell them apart, so no amount of it makes what the detector never finds exist."""
+    exists, _ = MODEL.existence(np.array([evidence, 0.0, 0.0]), np.zeros(3), -100.0, witness, -100.0)
+    assert exists == pytest.approx(1.0 / (1.0 + MODEL.config.detector.lookalike * np.exp(-witness)), rel=1e-3)
+
+
+@given(st.floats(0.05, 1.0))
+def test_being_missed_in_view_speaks_for_a_look_alike_and_being_out_of_sight_for_neither(visible):
+    unseen, seen = (
+        Scores(np.zeros(1), np.full(1, 100.0), np.full(1, 100.0 * v), np.array([[10.0, 10.0, 50.0, 60.0]]))
+        for v in (0.0, visible)
+    )
+    assert MODEL.witness(unseen, None, (640, 480))[0] == 0.0
+    assert MODEL.witness(seen, None, (640, 480))[0] < 0.0
+    found = Detection((10.0, 10.0, 40.0, 50.0), np.array([0.1, 0.3, 0.3, 0.3]))
+    assert MODEL.witness(seen, found, (640, 480))[0] > MODEL.witness(seen, None, (640, 480))[0]
 
 
 @given(st.floats(0.0, 0.1), st.floats(0.0, 0.1), st.floats(0.1, 5.0))
