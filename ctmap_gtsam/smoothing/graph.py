@@ -61,6 +61,29 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Variable:
+    """What a key stands for."""
+
+    kind: str
+    """x, o or b, as above"""
+    row: int | None
+    """the object; None for cameras"""
+    index: int
+    """the keyframe, or the visit of b"""
+
+    @classmethod
+    def of(cls, key: int) -> Variable:
+        """The variable of a key of `camera_key`, `object_key` or `bias_key`."""
+        symbol = gtsam.Symbol(key)
+        kind, index = chr(symbol.chr()), symbol.index()
+        return cls(kind, None, index) if kind == "x" else cls(kind, *divmod(index, _STRIDE))
+
+    def __str__(self) -> str:
+        """x<keyframe>, o<object>k<keyframe>, b<object>v<visit>."""
+        return f"x{self.index}" if self.row is None else f"{self.kind}{self.row}{'kv'[self.kind == 'b']}{self.index}"
+
+
+@dataclass(frozen=True)
 class Label:
     """What a factor is."""
 
@@ -68,6 +91,19 @@ class Label:
     """localisation, bias, measurement, prediction, context, gauge"""
     name: str
     keys: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Factors that are a relative pose between two, with the error log(T^-1 T_a^-1 T_b)."""
+
+    kind: str
+    keys: NDArray[np.int64]
+    """(n, 2) of a and b"""
+    T: Array
+    """(n, 4, 4)"""
+    information: Array
+    """(n, 6, 6) of the right tangent; nothing along free axes"""
 
 
 @dataclass(eq=False)
@@ -120,6 +156,20 @@ class SmootherGraph:
         """Number of factors by kind."""
         return dict(Counter(label.kind for label in self.labels))
 
+    def edges(self, values: Any) -> list[Edges]:
+        """Measurements and predictions as relative poses, with symmetries and biases as they are at given values.
+
+        A measurement's error is that of its edge to first order in the bias; without one they are equal.
+        """
+        return [
+            *_between_edges(self._compiled, self._compiled_labels),
+            *(
+                _edges(batch, batch.terms, values)
+                for batch in self._batches
+                if isinstance(batch.terms, Modes | Predictions)
+            ),
+        ]
+
     def errors(self, values: Any) -> Array:
         """Each factor's error (n,) at given values in the order of `labels`, nats but for constants."""
         compiled = [self._compiled.at(i).error(values) for i in range(self._compiled.size())]
@@ -144,6 +194,39 @@ class Smoothed:
     """(K, 6, 6)"""
     objects: Mapping[int, Mapping[int, tuple[Array, Array]]]
     """object -> keyframe -> T_world_centre (4, 4) and covariance (6, 6)"""
+
+
+def _between_edges(compiled: Any, labels: Sequence[Label]) -> list[Edges]:
+    """GTSAM's own between factors."""
+    out = []
+    for kind in dict.fromkeys(label.kind for label in labels):
+        those = [
+            (label.keys, compiled.at(i))
+            for i, label in enumerate(labels)
+            if label.kind == kind and isinstance(compiled.at(i), gtsam.BetweenFactorPose3)
+        ]
+        if those:
+            keys = np.array([k for k, _ in those])
+            T = np.stack([factor.measured().matrix() for _, factor in those])
+            roots = np.stack([factor.noiseModel().R() for _, factor in those])
+            out.append(Edges(kind, keys, T, np.swapaxes(roots, -1, -2) @ roots))
+    return out
+
+
+def _edges(batch: Batch, terms: Modes | Predictions, values: Any) -> Edges:
+    """r = log(T^-1 X g) - b of X = T_a^-1 T_b as an edge: Ad(g) r is about the error to T exp(b) g^-1."""
+    S = terms.symmetry
+    poses = [np.stack([values.atPose3(key).matrix() for key in column]) for column in batch.keys.T[:2].tolist()]
+    X = se3.inverse(poses[0]) @ poses[1]
+    if isinstance(terms, Modes):
+        T, R = terms.T_camera_mode, terms.whitener
+    else:
+        T, R = np.broadcast_to(np.eye(4), X.shape), terms.whitener @ S.projection
+    to_image = se3.inverse(symmetry.nearest_image(T, X, S)) @ X  # g^-1
+    if batch.keys.shape[1] == 3:
+        T = se3.retract(T, np.stack([values.atVector(key) for key in batch.keys[:, 2].tolist()]))
+    root = R @ se3.adjoint(to_image)
+    return Edges(batch.kind, batch.keys[:, :2], T @ to_image, np.swapaxes(root, -1, -2) @ root)
 
 
 def camera_key(keyframe: int) -> int:
