@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -34,23 +35,21 @@ COLOURS = {
     "context": "#cc79a7",
     "gauge": "#e69f00",
 }
-_SATURATED = 10.0  # nats at which the picture's colours end
+_SCALE = Normalize(0.0, 10.0)  # nats, of the picture's colours
+_MAP = colormaps["viridis_r"]
 _TANGENT = np.array([3, 4, 5, 0, 1, 2])  # g2o has translations first
 
 
-def write_graph(
-    folder: Path, built: SmootherGraph, values: Any, names: Mapping[int, str] | None = None
-) -> tuple[Path, ...]:
+def write_graph(folder: Path, built: SmootherGraph, values: Any) -> tuple[Path, ...]:
     """Write factors.csv, graph.dot, graph.g2o and graph.png; returns their paths.
 
     Args:
         folder: is made.
         built: from `smoothing.graph.build`.
         values: gtsam.Values of its variables.
-        names: what to call objects beside their numbers.
     """
     image = io.BytesIO()
-    picture(built, values, names).savefig(image, format="png", dpi=150)
+    picture(built, values).savefig(image, format="png", dpi=150)
     files = {
         folder / "factors.csv": factor_table(built, values).encode(),
         folder / "graph.dot": dot(built, values).encode(),
@@ -92,20 +91,22 @@ def dot(built: SmootherGraph, values: Any) -> str:
         # beside its variables, for the factors of one variable would lie on top of it
         where = np.mean([at[key] for key in label.keys], axis=0) + (0.25 if len(label.keys) == 1 else 0.0)
         style = f'shape=square, label="", width=0.12, style=filled, fillcolor="{COLOURS.get(label.kind, "white")}"'
-        lines.append(
-            f'  f{i} [{style}, pos="{_pos(where)}", tooltip="{label.kind}, {label.name}: {error:.4g} nats"];'
-        )
+        lines.append(f'  f{i} [{style}, pos="{_pos(where)}", tooltip="{label.kind}, {label.name}: {error:.4g} nats"];')
         lines += [f'  f{i} -- "{Variable.of(key)}";' for key in label.keys]
     return "\n".join([*lines, "}"]) + "\n"
 
 
-def g2o(built: SmootherGraph, values: Any) -> str:
-    """Poses and factors between two poses in g2o's format (Kuemmerle et al., ICRA 2011): VERTEX_SE3:QUAT, EDGE_SE3:QUAT.
+def _shades(errors: Array) -> list[tuple[float, float, float, float]]:
+    return [(float(r), float(g), float(b), float(a)) for r, g, b, a in _MAP(_SCALE(errors))]
 
-    Comments say which number is which variable, and which factors are left out: g2o knows no factors of one pose, none
-    of localisation's error that decays, no context, and no symmetry. So the first camera is fixed, an edge is to that of
-    the equivalent poses which is nearest at the values, without information along free axes, and the error of a visit
-    is taken as it is at the values.
+
+def g2o(built: SmootherGraph, values: Any) -> str:
+    """Poses and the factors between two of them in g2o's format (Kuemmerle et al., ICRA 2011).
+
+    They are VERTEX_SE3:QUAT and EDGE_SE3:QUAT. Comments say which number is which variable, and how many factors are
+    left out. g2o knows no factors of one pose, no error of localisation that decays, no context and no symmetry: the
+    first camera is fixed, an edge leads to that of the equivalent poses which is nearest at the values, without
+    information along free axes, and the error of a visit is taken as it is at the values.
     """
     poses = [key for key in built.initial.keys() if Variable.of(key).kind != "b"]  # noqa: SIM118 (not a mapping)
     poses.sort(key=lambda key: Variable.of(key).kind != "x")  # cameras first
@@ -154,7 +155,7 @@ def _lines(variables: list[Variable]) -> dict[int | None, int]:
     return {None: 0, **{row: i + 1 for i, row in enumerate(rows)}}
 
 
-def picture(built: SmootherGraph, values: Any, names: Mapping[int, str] | None = None) -> Figure:
+def picture(built: SmootherGraph, values: Any) -> Figure:
     """Keyframes as columns, the cameras and below them the objects as rows, factors coloured by their error.
 
     A dot is a measurement (in the first row: a prior), a line between dots a prediction (localisation that drifts), so
@@ -165,9 +166,10 @@ def picture(built: SmootherGraph, values: Any, names: Mapping[int, str] | None =
     line = _lines([v for those in variables for v in those])
     errors = built.errors(values)
     columns = 1 + max((v.index for those in variables for v in those if v.kind != "b"), default=0)
-    figure = Figure(figsize=(float(np.clip(0.13 * columns + 3.0, 7.0, 30.0)), 1.4 + 0.36 * len(line)), layout="constrained")
+    figure = Figure(
+        figsize=(float(np.clip(0.13 * columns + 3.0, 7.0, 30.0)), 1.4 + 0.36 * len(line)), layout="constrained"
+    )
     axes = figure.add_subplot()
-    colours = ScalarMappable(Normalize(0.0, _SATURATED), "viridis_r")
     dots: list[tuple[float, float, float, bool]] = []
     strokes: list[tuple[list[tuple[float, float]], float, float]] = []
     spans: dict[Variable, list[int]] = {}
@@ -187,15 +189,18 @@ def picture(built: SmootherGraph, values: Any, names: Mapping[int, str] | None =
         for v, ks in spans.items()
     ]
     if strokes:
-        shades = colours.to_rgba([error for _, error, _ in strokes])
+        shades = _shades(np.array([error for _, error, _ in strokes]))
         widths = [width for *_, width in strokes]
         axes.add_collection(LineCollection([at for at, *_ in strokes], colors=shades, linewidths=widths, zorder=1))
     for ring in (True, False):
         x, y, error = np.array([d[:3] for d in dots if d[3] is ring]).reshape(-1, 3).T
-        shade = colours.to_rgba(error)
-        axes.scatter(x, y, s=34 if ring else 13, c="none" if ring else shade, edgecolors=shade, linewidths=0.8, zorder=2)
-    names = names or {}
-    axes.set_yticks(list(line.values()), ["camera", *(f"{row} {names.get(row, '')}".strip() for row in list(line)[1:])])
+        shade = _shades(error)
+        axes.scatter(
+            x, y, s=34 if ring else 13, facecolors="none" if ring else shade, edgecolors=shade, linewidths=0.8, zorder=2
+        )
+    axes.set_yticks(
+        list(line.values()), ["camera", *(f"{built.objects[row]} {row}" for row in line if row is not None)]
+    )
     axes.set(xlim=(-1, columns), ylim=(len(line) - 0.4, -0.6), xlabel="keyframe")
     axes.tick_params(labelsize=8, length=0)
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -203,5 +208,5 @@ def picture(built: SmootherGraph, values: Any, names: Mapping[int, str] | None =
     axes.set_axisbelow(True)
     told = ", ".join(f"{n} {kind}" for kind, n in built.count().items())
     axes.set_title(f"{told}; {errors.sum():.4g} nats", fontsize=9, loc="left")
-    figure.colorbar(colours, ax=axes, label="error, nats", extend="max", pad=0.01, fraction=0.03)
+    figure.colorbar(ScalarMappable(_SCALE, _MAP), ax=axes, label="error, nats", extend="max", pad=0.01, fraction=0.03)
     return figure

@@ -41,7 +41,7 @@ class Problem:
     Args:
         compiled: gtsam.NonlinearFactorGraph of all factors that aren't in batches.
         batches: the others.
-        values: gtsam.Values that holds all variables; what is evaluated later has the same keys.
+        values: gtsam.Values that holds all variables, poses and 6-vectors; what is evaluated later has the same keys.
     """
 
     def __init__(self, compiled: Any, batches: Sequence[Batch], values: Any) -> None:
@@ -79,7 +79,7 @@ class Problem:
         rows = gtsam.utilities.extractPose3(values)
         poses = np.zeros((len(rows), 4, 4))
         poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:], 1.0
-        vectors = np.array([values.atVector(key) for key in self._vectors]).reshape(len(self._vectors), -1)
+        vectors = np.array([values.atVector(key) for key in self._vectors]).reshape(-1, 6)
         out = []
         for batch, places in zip(self._batches, self._places, strict=True):
             arrays = [(poses if among_poses else vectors)[at] for among_poses, at in places]

@@ -112,6 +112,8 @@ class SmootherGraph:
 
     initial: Any = field(default_factory=gtsam.Values)
     """gtsam.Values"""
+    objects: dict[int, str] = field(default_factory=dict)
+    """object -> its class's name"""
     _compiled: Any = field(default_factory=gtsam.NonlinearFactorGraph)
     _compiled_labels: list[Label] = field(default_factory=list)
     _batches: list[Batch] = field(default_factory=list)
@@ -261,6 +263,7 @@ def build(
     built = SmootherGraph()
     _add_cameras(built, cameras, noise)
     for row, (shape, measured) in objects.items():
+        built.objects[row] = shape.source.name
         _add_object(built, model, row, shape, measured, cameras)
     if model.context:
         _add_context(built, model, objects)
