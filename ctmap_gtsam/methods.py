@@ -15,7 +15,7 @@ from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.literal import literal_filter_run
-from ctmap_gtsam.smoothing.smoother import smooth_run
+from ctmap_gtsam.smoothing.smoother import Look, smooth_run
 from sequences.progress import Progress
 from sequences.types import Run
 
@@ -62,8 +62,8 @@ def _literal(run: Run, config: Config, progress: Progress, *, context: bool) -> 
     return literal_filter_run(run, config, context=context, progress=progress)
 
 
-def _smooth(run: Run, config: Config, progress: Progress, forward: Estimate) -> Estimate:
-    return smooth_run(run, forward, config, progress=progress)
+def _smooth(run: Run, config: Config, progress: Progress, forward: Estimate, look: Look | None = None) -> Estimate:
+    return smooth_run(run, forward, config, progress=progress, look=look)
 
 
 METHODS: dict[str, Method] = {

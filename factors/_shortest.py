@@ -19,9 +19,8 @@ def _hat(a):
 
 
 @numba.njit(**_KERNEL)
-def _quaternion(R):
-    """[x, y, z, w] up to sign, by the best conditioned of Shepperd's four formulas."""
-    q = np.empty(4)
+def _quaternion(R, q):
+    """[x, y, z, w] up to sign into q (4,), by the best conditioned of Shepperd's four formulas."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     i = 3
     largest = trace
@@ -36,16 +35,9 @@ def _quaternion(R):
         q[i] = 1.0 + 2.0 * R[i, i] - trace
         q[j], q[k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
         q[3] = R[k, j] - R[j, k]
-    return q / math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-
-
-@numba.njit(**_KERNEL)
-def _so3_log(R):
-    q = _quaternion(R)
-    if q[3] < 0.0:
-        q = -q
-    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
-    return q[:3] * (2.0 / q[3] if norm < 1e-9 else 2.0 * math.atan2(norm, q[3]) / norm)
+    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for a in range(4):
+        q[a] /= norm
 
 
 @numba.njit(**_KERNEL)
@@ -57,26 +49,44 @@ def _curvature(angle):
 
 
 @numba.njit(**_KERNEL)
-def _log(T):
-    """The tangent [rotation, translation] of one motion (4, 4)."""
-    w = _so3_log(T[:3, :3])
-    W = _hat(w)
-    t = T[:3, 3].copy()
-    Wt = W @ t
-    r = np.empty(6)
-    r[:3] = w
-    r[3:] = t - 0.5 * Wt + _curvature(math.sqrt((w**2).sum())) * (W @ Wt)
-    return r
+def _log(T, q, r):
+    """The tangent [rotation, translation] of one motion (4, 4) into r (6,). q is (4,) to write into."""
+    _quaternion(T, q)
+    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
+    sign = -1.0 if q[3] < 0.0 else 1.0
+    scale = 2.0 / q[3] if norm < 1e-9 else sign * 2.0 * math.atan2(norm, sign * q[3]) / norm
+    x, y, z = scale * q[0], scale * q[1], scale * q[2]
+    k = _curvature(math.sqrt(x * x + y * y + z * z))
+    # w x t, and w x (w x t)
+    a, b, c = y * T[2, 3] - z * T[1, 3], z * T[0, 3] - x * T[2, 3], x * T[1, 3] - y * T[0, 3]
+    r[0], r[1], r[2] = x, y, z
+    r[3] = T[0, 3] - 0.5 * a + k * (y * c - z * b)
+    r[4] = T[1, 3] - 0.5 * b + k * (z * a - x * c)
+    r[5] = T[2, 3] - 0.5 * c + k * (x * b - y * a)
 
 
 @numba.njit(**_KERNEL)
-def _right_jacobian_inverse(r):
-    """(6,) -> (6, 6): log(exp(r) exp(d)) ~ r + J_r^-1 d."""
-    angle = math.sqrt((r[:3] ** 2).sum())
-    W, V = _hat(-r[:3]), _hat(-r[3:])
-    inverse = np.eye(3) - 0.5 * W + _curvature(angle) * (W @ W)
-    a, a2 = angle, angle * angle
-    if angle < 1e-2:
+def _product(A, B, out):
+    """A @ B of 3 x 3 matrices, without a call to BLAS, which costs more than the product."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@numba.njit(**_KERNEL)
+def _fill_hat(x, y, z, out):
+    out[0, 0] = out[1, 1] = out[2, 2] = 0.0
+    out[0, 1], out[0, 2], out[1, 2] = -z, y, -x
+    out[1, 0], out[2, 0], out[2, 1] = z, -y, x
+
+
+@numba.njit(**_KERNEL)
+def _right_jacobian_inverse(r, work, A, B):
+    """log(exp(r) exp(d)) ~ r + J_r^-1 d, with J_r^-1 = [[A, 0], [B, A]]. `work` is (7, 3, 3) to write into."""
+    W, V, WV, VW, WVW, Q, product = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    a2 = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
+    a = math.sqrt(a2)
+    if a < 1e-2:
         c1 = 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
         c2 = 1.0 / 24.0 - a2 / 720.0 + a2 * a2 / 40320.0
         c3 = 1.0 / 120.0 - a2 / 2520.0 + a2 * a2 / 120960.0
@@ -85,34 +95,56 @@ def _right_jacobian_inverse(r):
         c1 = (a - sin) / a**3
         c2 = (a2 + 2.0 * cos - 2.0) / (2.0 * a**4)
         c3 = (2.0 * a - 3.0 * sin + a * cos) / (2.0 * a**5)
-    WV, VW = W @ V, V @ W
-    WVW = WV @ W
-    Q = 0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3.0 * WVW) + c3 * (WVW @ W + W @ WVW)
-    out = np.zeros((6, 6))
-    out[:3, :3] = inverse
-    out[3:, 3:] = inverse
-    out[3:, :3] = -inverse @ Q @ inverse
-    return out
+    _fill_hat(-r[0], -r[1], -r[2], W)
+    _fill_hat(-r[3], -r[4], -r[5], V)
+    _product(W, W, A)
+    k = _curvature(a)
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = k * A[i, j] - 0.5 * W[i, j]
+        A[i, i] += 1.0
+    _product(W, V, WV)
+    _product(V, W, VW)
+    _product(WV, W, WVW)
+    for i in range(3):
+        for j in range(3):
+            Q[i, j] = 0.5 * V[i, j] + c1 * (WV[i, j] + VW[i, j] + WVW[i, j]) - 3.0 * c2 * WVW[i, j]
+            for m in range(3):
+                Q[i, j] += c2 * (W[i, m] * WV[m, j] + VW[i, m] * W[m, j])
+                Q[i, j] += c3 * (WVW[i, m] * W[m, j] + W[i, m] * WVW[m, j])
+    _product(A, Q, product)
+    _product(product, A, B)
+    for i in range(3):
+        for j in range(3):
+            B[i, j] = -B[i, j]
 
 
 @numba.njit(**_KERNEL)
-def _inverse(T):
-    out = np.eye(4)
-    R = T[:3, :3].T.copy()
-    out[:3, :3] = R
-    out[:3, 3] = -(R @ T[:3, 3].copy())
-    return out
+def _times_adjoint_inverse(A, B, T, sign, work, out):
+    """out (6, 6) = sign [[A, 0], [B, A]] Ad(T^-1), Ad(T^-1) = [[R', 0], [-R' hat(t), R']]. `work` is (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            work[i, j] = sign * (A[i, 0] * T[j, 0] + A[i, 1] * T[j, 1] + A[i, 2] * T[j, 2])
+            out[3 + i, j] = sign * (B[i, 0] * T[j, 0] + B[i, 1] * T[j, 1] + B[i, 2] * T[j, 2])
+            out[i, j] = out[3 + i, 3 + j] = work[i, j]
+            out[i, 3 + j] = 0.0
+        x, y, z = T[0, 3], T[1, 3], T[2, 3]
+        out[3 + i, 0] -= work[i, 1] * z - work[i, 2] * y
+        out[3 + i, 1] -= work[i, 2] * x - work[i, 0] * z
+        out[3 + i, 2] -= work[i, 0] * y - work[i, 1] * x
 
 
 @numba.njit(**_KERNEL)
-def _adjoint_inverse(T):
-    """Ad(T^-1) (6, 6)."""
-    R = T[:3, :3].T.copy()
-    out = np.zeros((6, 6))
-    out[:3, :3] = R
-    out[3:, 3:] = R
-    out[3:, :3] = -R @ _hat(T[:3, 3])
-    return out
+def _relative(T_a, T_b, g, work, out):
+    """T_a^-1 T_b g into `out` (4, 4), whose last row is that of a motion already. `work` is (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            work[i, j] = T_a[0, i] * T_b[0, j] + T_a[1, i] * T_b[1, j] + T_a[2, i] * T_b[2, j]
+    _product(work, g, out)
+    x, y, z = T_b[0, 3] - T_a[0, 3], T_b[1, 3] - T_a[1, 3], T_b[2, 3] - T_a[2, 3]
+    for i in range(3):
+        out[i, 3] = T_a[0, i] * x + T_a[1, i] * y + T_a[2, i] * z
+        out[i, 3] += work[i, 0] * g[0, 3] + work[i, 1] * g[1, 3] + work[i, 2] * g[2, 3]
 
 
 @numba.njit(**_KERNEL)
@@ -123,7 +155,8 @@ def _untwisting(R, free, centre):
         U = R.T.copy()
     else:
         axis = free[:, 0].copy()
-        q = _quaternion(R)
+        q = np.empty(4)
+        _quaternion(R, q)
         angle = -2.0 * math.atan2((q[:3] * axis).sum(), q[3])
         W = _hat(axis)
         U = np.eye(3) + math.sin(angle) * W + (1.0 - math.cos(angle)) * (W @ W)
@@ -147,19 +180,24 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
         images: (n, 4, 4) out, the g.
         chosen: (n,) out, which discrete symmetry.
     """
+    work, q, r, g, M = np.empty((3, 3)), np.empty(4), np.empty(6), np.eye(4), np.eye(4)
     for n in range(T_a.shape[0]):
-        relative = _inverse(T_a[n]) @ T_b[n]
         best = np.inf
         for s in range(discrete.shape[0]):
-            g = discrete[s].copy()
+            g[:] = discrete[s]
+            _relative(T_a[n], T_b[n], g, work, M)
             if free.shape[1] > 0:
-                g = g @ _untwisting((relative @ g)[:3, :3].copy(), free, centre)
-            r = _log(relative @ g)
+                g[:] = g @ _untwisting(M[:3, :3].copy(), free, centre)
+                _relative(T_a[n], T_b[n], g, work, M)
+            _log(M, q, r)
             if information.shape[0] == 0:
-                length = (r[:3] ** 2).sum()
+                length = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
             else:
                 L = information[n if information.shape[0] > 1 else 0]
-                length = (r * (L @ r)).sum()
+                length = 0.0
+                for i in range(6):
+                    for j in range(6):
+                        length += r[i] * L[i, j] * r[j]
             if s == 0 or length < best:
                 best = length
                 residuals[n], images[n], chosen[n] = r, g, s
@@ -182,11 +220,16 @@ def shortest_jacobians(T_a, T_b, residuals, images, generators, reader, by_a, by
         by_a: (n, 6, 6) out.
         by_b: (n, 6, 6) out.
     """
+    work, A, B, M, right = np.empty((7, 3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.eye(4), np.zeros((6, 6))
+    free = generators.shape[1] > 0
     for n in range(T_a.shape[0]):
-        right = _right_jacobian_inverse(residuals[n])
-        if generators.shape[1] > 0:
+        _right_jacobian_inverse(residuals[n], work, A, B)
+        _relative(T_a[n], T_b[n], images[n], work[0], M)
+        _times_adjoint_inverse(A, B, images[n], 1.0, work[0], by_b[n])
+        _times_adjoint_inverse(A, B, M, -1.0, work[0], by_a[n])
+        if free:
+            right[:3, :3], right[3:, 3:], right[3:, :3] = A, A, B
             along = right @ generators
-            right = right - along @ (np.linalg.pinv(reader @ along) @ (reader @ right))
-        g = images[n].copy()
-        by_b[n] = right @ _adjoint_inverse(g)
-        by_a[n] = -right @ _adjoint_inverse(_inverse(T_a[n]) @ T_b[n] @ g)
+            off = along @ np.linalg.pinv(reader @ along) @ reader
+            by_b[n] -= off @ by_b[n]
+            by_a[n] -= off @ by_a[n]

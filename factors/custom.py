@@ -8,8 +8,7 @@ over as they mean.
 Inside GTSAM's own optimisers a callback's cost grows with the size of Values; with `graph.linearize(values)` on Values
 that Python owns it doesn't. A factor can't be copied or serialised: keep the numbers it was built from.
 
-The factors' errors are the potentials' energies but for constants: error = c - log potential, with c the potential's
-`mixture.log_constant`, or for context its peak.
+The residuals themselves are those of `factors.terms`.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import context, measurement, mixture
-from factors.symmetry import NONE, Symmetry, gauge_residual, reduced_residual_jacobians
+from factors.terms import Terms
 
 Array = NDArray[np.float64]
 Residual = Callable[[list[Array], bool], tuple[Array, Sequence[Array]]]
@@ -126,100 +124,25 @@ def _checked(name: str, array: Any, shape: tuple[int, ...], key: int | None) -> 
     return out
 
 
-def prediction_factor(name: str, key_a: int, key_b: int, sigma: ArrayLike, symmetry: Symmetry = NONE) -> Any:
-    """phi_p between an object's poses at two times; see `factors.prediction`.
+def terms_factor(name: str, keys: Sequence[int], terms: Terms) -> Any:
+    """One factor of `factors.terms` (batch shape ()) as a GTSAM factor.
 
     Args:
         name: for errors.
+        keys: as the form says.
+        terms: its numbers.
+    """
+    noise = gtsam.noiseModel.Unit.Create(terms.rows)
+    return custom_factor(name, keys, noise, lambda values, _need: terms.linearised(values))
+
+
+def stay_factor(key_a: int, key_b: int, sigma: ArrayLike) -> Any:
+    """phi_p of an object without symmetry in GTSAM's own compiled code: `terms.Predictions` says the same.
+
+    Args:
         key_a: Pose3 T_world_object before.
         key_b: Pose3 T_world_object after.
         sigma: (6, 6) from `prediction.covariance`.
-        symmetry: of the object.
     """
-    sigma = np.asarray(sigma, dtype=np.float64)
-    information = np.linalg.inv(sigma)
-    noise = gtsam.noiseModel.Gaussian.Covariance(symmetry.reduced_covariance(sigma))
-
-    def function(values: list[Array], _need: bool) -> tuple[Array, Sequence[Array]]:
-        r, J_a, J_b = reduced_residual_jacobians(values[0], values[1], symmetry, information)
-        return r, (J_a, J_b)
-
-    return custom_factor(name, (key_a, key_b), noise, function)
-
-
-def mode_factor(
-    name: str,
-    key_camera: int,
-    key_object: int,
-    T_camera_mode: ArrayLike,
-    information: ArrayLike,
-    symmetry: Symmetry = NONE,
-    key_bias: int | None = None,
-) -> Any:
-    """A measurement mode between camera, object and the bias of the visit; see `factors.measurement`.
-
-    Args:
-        name: for errors.
-        key_camera: Pose3 T_world_camera.
-        key_object: Pose3 T_world_object.
-        T_camera_mode: (4, 4).
-        information: (6, 6) in the object's tangent; its flat directions stay free.
-        symmetry: of the object.
-        key_bias: vector (6,) in the object's tangent; None = no bias.
-    """
-    information, mode = np.asarray(information, dtype=np.float64), np.asarray(T_camera_mode, dtype=np.float64)
-    whiten = mixture.square_root(symmetry.reduced_information(information)) @ symmetry.projection
-    keys = (key_camera, key_object) if key_bias is None else (key_camera, key_object, key_bias)
-
-    def function(values: list[Array], _need: bool) -> tuple[Array, Sequence[Array]]:
-        bias = values[2] if len(values) == 3 else None
-        r, J_camera, J_object = measurement.mode_residual_jacobians(
-            values[0], values[1], mode, bias, symmetry, information
-        )
-        jacobians = [whiten @ J_camera, whiten @ J_object] + ([] if bias is None else [-whiten])
-        return whiten @ r, jacobians
-
-    return custom_factor(name, keys, gtsam.noiseModel.Unit.Create(len(whiten)), function)
-
-
-def context_factor(
-    name: str,
-    key_a: int,
-    key_b: int,
-    centres: tuple[ArrayLike, ArrayLike],
-    pair: context.PairMixture,
-    instance: float = 0.0,
-    keyframes: int = 1,
-) -> Any:
-    """phi_c between two objects at one time; see `factors.context`.
-
-    Args:
-        name: for errors.
-        key_a: Pose3 T_world_object of one.
-        key_b: Pose3 T_world_object of the other.
-        centres: (3,) of each, object frames, between which the distance is taken.
-        pair: of their classes, shape ().
-        instance: log(phi_ins / phi_background), nats.
-        keyframes: n, over how many keyframes this one fact is spread.
-    """
-    a, b = (np.asarray(centre, dtype=np.float64) for centre in centres)
-    share = 1.0 / np.sqrt(keyframes)
-
-    def function(values: list[Array], _need: bool) -> tuple[Array, Sequence[Array]]:
-        distance, J_a, J_b = context.pair_distance_jacobians(values[0], values[1], a, b)
-        e, slope, _ = context.context_residual(distance, pair, instance)
-        return share * e[None], (share * slope * J_a[None], share * slope * J_b[None])
-
-    return custom_factor(name, (key_a, key_b), gtsam.noiseModel.Unit.Create(1), function)
-
-
-def gauge_factor(name: str, key: int, T_reference: ArrayLike, symmetry: Symmetry, sigma_rad: float = np.pi) -> Any:
-    """What holds a symmetric object's free directions near a reference pose (4, 4); see `symmetry.gauge_residual`."""
-    reference = np.asarray(T_reference, dtype=np.float64)
-    noise = gtsam.noiseModel.Isotropic.Sigma(symmetry.free, sigma_rad)
-
-    def function(values: list[Array], _need: bool) -> tuple[Array, Sequence[Array]]:
-        r, J = gauge_residual(reference, values[0], symmetry)
-        return r, (J,)
-
-    return custom_factor(name, (key,), noise, function)
+    noise = gtsam.noiseModel.Gaussian.Covariance(np.asarray(sigma, dtype=np.float64))
+    return gtsam.BetweenFactorPose3(key_a, key_b, gtsam.Pose3(), noise)

@@ -137,10 +137,10 @@ def null_information(rotation_sigma_rad: float = np.pi, translation_sigma_m: flo
 
 
 def square_root(information: ArrayLike, relative_floor: float = 1e-12) -> Array:
-    """R (k, d) with R^T R = L for one L (d, d) of rank k: a whitener that leaves flat directions free.
+    """R (..., d, d) with R^T R = L (..., d, d): a whitener, whose row is zero for each direction in which L is flat.
 
     Eigenvalues below `relative_floor` of the largest count as none.
     """
     values, vectors = np.linalg.eigh(np.asarray(information, dtype=np.float64))
-    kept = values > relative_floor * max(values[-1], 0.0)
-    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+    kept = values > relative_floor * np.maximum(values[..., -1:], 0.0)
+    return np.sqrt(np.where(kept, values, 0.0))[..., None] * np.swapaxes(vectors, -1, -2)

@@ -11,7 +11,7 @@ from ctmap_gtsam.runtime.versions import versions
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
 
-BENCHES = {name: f"ctmap_gtsam.bench.{name}" for name in ("detector", "highlight", "realism", "render")}
+BENCHES = {name: f"ctmap_gtsam.bench.{name}" for name in ("detector", "highlight", "realism", "render", "solver")}
 """Name -> module"""
 
 

@@ -26,6 +26,17 @@ def render(
 
 
 @bench_app.command()
+def solver(
+    json_file: JsonFile = None, config_file: ConfigFile = None, assignments: Assignments = None, seed: Seed = None
+) -> None:
+    """Seconds to solve the smoother's graph, beside GTSAM's own optimiser on the same and on C++ factors.
+
+    Example: `ctmap bench solver --json solver.json`
+    """
+    _figures("solver", json_file, config_file, assignments, seed)
+
+
+@bench_app.command()
 def paper(
     out: Out,
     seeds: Annotated[

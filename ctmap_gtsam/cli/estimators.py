@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +14,8 @@ from sequences.errors import InputError
 
 if TYPE_CHECKING:
     from ctmap_gtsam.config import Config
+    from ctmap_gtsam.methods import Method
+    from ctmap_gtsam.smoothing.graph import Smoothed, SmootherGraph
 
 NoContext = Annotated[bool, typer.Option("--no-context", help="Leave the context between objects out.")]
 AsInPaper = Annotated[bool, typer.Option("--paper", help="Algorithm 1 and the potentials to the letter of the paper.")]
@@ -41,6 +45,9 @@ def smooth(
     run: RunFolder,
     out: Out,
     no_context: NoContext = False,
+    graph: Annotated[
+        Path | None, typer.Option("--graph", metavar="DIR", help="Folder for the factor graph, to look into.")
+    ] = None,
     scene: Scene = None,
     config_file: ConfigFile = None,
     assignments: Assignments = None,
@@ -48,9 +55,14 @@ def smooth(
 ) -> None:
     """Smooth a run: each frame's map knows the whole run. Writes DIR/smooth-ct.npz (smooth-t without context).
 
-    Example: `ctmap smooth recordings/kitchen --out results`
+    With --graph also the last round's factors with their errors (factors.csv), the graph for Graphviz (graph.dot) and
+    g2o (graph.g2o), and a picture (graph.png).
+
+    Example: `ctmap smooth recordings/kitchen --out results --graph results/graph`
     """
-    _estimate("smooth-t" if no_context else "smooth-ct", run, scene, out, settings(config_file, assignments, seed))
+    method = "smooth-t" if no_context else "smooth-ct"
+    folder = None if graph is None else writable(graph)
+    _estimate(method, run, scene, out, settings(config_file, assignments, seed), folder)
 
 
 def compare(
@@ -101,8 +113,10 @@ def compare_and_show(run: Path, out: Path, config: Config, methods: list[str] | 
     typer.echo(out / REPORT)
 
 
-def _estimate(method: str, run_path: Path, scene: int | None, out: Path, config: Config) -> None:
-    from ctmap_gtsam.cli.show import show_estimate
+def _estimate(
+    method: str, run_path: Path, scene: int | None, out: Path, config: Config, graph: Path | None = None
+) -> None:
+    from ctmap_gtsam.cli.show import show_estimate, show_solver
     from ctmap_gtsam.comparing import run_methods
     from ctmap_gtsam.runtime.progress import RichProgress
     from sequences.bop import load_run
@@ -110,9 +124,26 @@ def _estimate(method: str, run_path: Path, scene: int | None, out: Path, config:
     path = writable(out) / f"{method}.npz"
     run = load_run(run_path, scene=scene)
     with RichProgress() as progress:
-        outcome = run_methods(run, [method], config, progress=progress)[method]
+        registry = None if graph is None else _looking(method, graph)
+        outcome = run_methods(run, [method], config, progress=progress, registry=registry)[method]
     if outcome.estimate is None:
         raise InputError(f"{method} can't run: {outcome.reason}", file=run_path, remedy=outcome.remedy)
     outcome.estimate.save(path)
     show_estimate(outcome.estimate, run.catalogue)
+    show_solver(outcome.estimate, config.smoother)
     typer.echo(path)
+    if graph is not None:
+        typer.echo(graph)
+
+
+def _looking(method: str, folder: Path) -> dict[str, Method]:
+    """The methods, of which one, a smoother, writes its graph into a folder."""
+    from ctmap_gtsam.export.graph import write_graph
+    from ctmap_gtsam.methods import METHODS
+
+    def look(graph: SmootherGraph, smoothed: Smoothed) -> None:
+        write_graph(folder, graph, smoothed.solution.values)
+
+    known = METHODS[method]
+    assert known.run is not None
+    return {**METHODS, method: replace(known, run=partial(known.run, look=look))}

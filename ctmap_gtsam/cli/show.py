@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from ctmap_gtsam.estimate import Estimate
     from ctmap_gtsam.learning.persistence import Persistence
+    from ctmap_gtsam.parameters import Smoother
     from sequences.catalogue import Catalogue
     from sequences.validation import Facts, Inspection
 
@@ -80,6 +81,27 @@ def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:
             )
         ),
     )
+
+
+def show_solver(estimate: Estimate, settings: Smoother) -> None:
+    """On stderr, where a smoother's solver ended in another way than at a minimum."""
+    told = estimate.meta.get("diagnostics", {}).get("solver")
+    if told is None or told["end"] == "converged":
+        return
+    trace = told["trace"]
+    if told["end"] == "cap":
+        fell = trace[-2] - trace[-1]
+        typer.echo(
+            f"the solver hasn't converged: the last of smoother.max_iterations = {settings.max_iterations} steps still "
+            f"lowered the energy by {fell:.3g} of {trace[-1]:.6g} nats (smoother.tolerance = {settings.tolerance:g})",
+            err=True,
+        )
+    else:
+        typer.echo(
+            f"the solver has stalled after {len(trace) - 1} steps at {trace[-1]:.6g} nats: no step lowers the energy, "
+            "though the factors' derivatives say that one should",
+            err=True,
+        )
 
 
 def show_summary(path: Path) -> None:

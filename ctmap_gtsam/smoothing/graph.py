@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import gtsam
@@ -19,9 +20,11 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
+from ctmap_gtsam.smoothing.batched import Batch, Problem
 from ctmap_gtsam.smoothing.solver import Solution, optimise
 from factors import symmetry
-from factors.custom import context_factor, custom_factor, gauge_factor, mode_factor, prediction_factor
+from factors.custom import stay_factor, terms_factor
+from factors.terms import Contexts, Drifts, Gauges, Modes, Predictions
 from sequences import se3
 from sequences.types import LocalisationNoise
 
@@ -57,31 +60,128 @@ class Camera:
     visit: int
 
 
-@dataclass
+@dataclass(frozen=True)
+class Variable:
+    """What a key stands for."""
+
+    kind: str
+    """x, o or b, as above"""
+    row: int | None
+    """the object; None for cameras"""
+    index: int
+    """the keyframe, or the visit of b"""
+
+    @classmethod
+    def of(cls, key: int) -> Variable:
+        """The variable of a key of `camera_key`, `object_key` or `bias_key`."""
+        symbol = gtsam.Symbol(key)
+        kind, index = chr(symbol.chr()), symbol.index()
+        return cls(kind, None, index) if kind == "x" else cls(kind, *divmod(index, _STRIDE))
+
+    def __str__(self) -> str:
+        """x<keyframe>, o<object>k<keyframe>, b<object>v<visit>."""
+        return f"x{self.index}" if self.row is None else f"{self.kind}{self.row}{'kv'[self.kind == 'b']}{self.index}"
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a factor is."""
+
+    kind: str
+    """localisation, bias, measurement, prediction, context, gauge"""
+    name: str
+    keys: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Factors that are a relative pose between two, with the error log(T^-1 T_a^-1 T_b)."""
+
+    kind: str
+    keys: NDArray[np.int64]
+    """(n, 2) of a and b"""
+    T: Array
+    """(n, 4, 4)"""
+    information: Array
+    """(n, 6, 6) of the right tangent; nothing along free axes"""
+
+
+@dataclass(eq=False)
 class SmootherGraph:
-    """The graph, its initial values, and what each factor is."""
+    """The factors, the initial values, and what each factor is."""
 
-    graph: Any
-    """gtsam.NonlinearFactorGraph"""
-    initial: Any
+    initial: Any = field(default_factory=gtsam.Values)
     """gtsam.Values"""
-    kinds: list[str] = field(default_factory=list)
-    """one a factor: localisation, bias, measurement, prediction, context, gauge"""
+    objects: dict[int, str] = field(default_factory=dict)
+    """object -> its class's name"""
+    _compiled: Any = field(default_factory=gtsam.NonlinearFactorGraph)
+    _compiled_labels: list[Label] = field(default_factory=list)
+    _batches: list[Batch] = field(default_factory=list)
 
-    def add(self, kind: str, factor: Any) -> None:
-        """Add a factor of a kind."""
-        self.graph.add(factor)
-        self.kinds.append(kind)
+    def add(self, kind: str, name: str, factor: Any) -> None:
+        """Add a factor of GTSAM's own."""
+        self._compiled.add(factor)
+        self._compiled_labels.append(Label(kind, name, tuple(factor.keys())))
+
+    def add_batch(self, batch: Batch) -> None:
+        """Add factors of one form."""
+        self._batches.append(batch)
+
+    @property
+    def batches(self) -> tuple[Batch, ...]:
+        """The factors that are evaluated together."""
+        return tuple(self._batches)
+
+    @property
+    def labels(self) -> list[Label]:
+        """What each factor is, in the order of `to_gtsam`."""
+        return self._compiled_labels + [
+            Label(batch.kind, name, tuple(keys))
+            for batch in self._batches
+            for name, keys in zip(batch.names, batch.keys.tolist(), strict=True)
+        ]
+
+    def problem(self) -> Problem:
+        """The same as the solver takes it."""
+        return Problem(self._compiled, self._batches, self.initial)
+
+    def to_gtsam(self) -> Any:
+        """The same as a gtsam.NonlinearFactorGraph, with a CustomFactor for each that GTSAM has none for."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(self._compiled)
+        for batch in self._batches:
+            for i, (name, keys) in enumerate(zip(batch.names, batch.keys.tolist(), strict=True)):
+                graph.add(terms_factor(name, keys, batch.terms[i]))
+        return graph
 
     def count(self) -> dict[str, int]:
         """Number of factors by kind."""
-        return dict(Counter(self.kinds))
+        return dict(Counter(label.kind for label in self.labels))
+
+    def edges(self, values: Any) -> list[Edges]:
+        """Measurements and predictions as relative poses, with symmetries and biases as they are at given values.
+
+        A measurement's error is that of its edge to first order in the bias; without one they are equal.
+        """
+        return [
+            *_between_edges(self._compiled, self._compiled_labels),
+            *(
+                _edges(batch, batch.terms, values)
+                for batch in self._batches
+                if isinstance(batch.terms, Modes | Predictions)
+            ),
+        ]
+
+    def errors(self, values: Any) -> Array:
+        """Each factor's error (n,) at given values in the order of `labels`, nats but for constants."""
+        compiled = [self._compiled.at(i).error(values) for i in range(self._compiled.size())]
+        return np.concatenate([compiled, *self.problem().batch_errors(values)])
 
     def energy(self, values: Any) -> dict[str, float]:
         """Error by kind at given values, nats."""
-        out: dict[str, float] = dict.fromkeys(self.kinds, 0.0)
-        for i, kind in enumerate(self.kinds):
-            out[kind] += self.graph.at(i).error(values)
+        out: dict[str, float] = {}
+        for label, error in zip(self.labels, self.errors(values).tolist(), strict=True):
+            out[label.kind] = out.get(label.kind, 0.0) + error
         return out
 
 
@@ -96,6 +196,39 @@ class Smoothed:
     """(K, 6, 6)"""
     objects: Mapping[int, Mapping[int, tuple[Array, Array]]]
     """object -> keyframe -> T_world_centre (4, 4) and covariance (6, 6)"""
+
+
+def _between_edges(compiled: Any, labels: Sequence[Label]) -> list[Edges]:
+    """GTSAM's own between factors."""
+    out = []
+    for kind in dict.fromkeys(label.kind for label in labels):
+        those = [
+            (label.keys, compiled.at(i))
+            for i, label in enumerate(labels)
+            if label.kind == kind and isinstance(compiled.at(i), gtsam.BetweenFactorPose3)
+        ]
+        if those:
+            keys = np.array([k for k, _ in those])
+            T = np.stack([factor.measured().matrix() for _, factor in those])
+            roots = np.stack([factor.noiseModel().R() for _, factor in those])
+            out.append(Edges(kind, keys, T, np.swapaxes(roots, -1, -2) @ roots))
+    return out
+
+
+def _edges(batch: Batch, terms: Modes | Predictions, values: Any) -> Edges:
+    """r = log(T^-1 X g) - b of X = T_a^-1 T_b as an edge: Ad(g) r is about the error to T exp(b) g^-1."""
+    S = terms.symmetry
+    poses = [np.stack([values.atPose3(key).matrix() for key in column]) for column in batch.keys.T[:2].tolist()]
+    X = se3.inverse(poses[0]) @ poses[1]
+    if isinstance(terms, Modes):
+        T, R = terms.T_camera_mode, terms.whitener
+    else:
+        T, R = np.broadcast_to(np.eye(4), X.shape), terms.whitener @ S.projection
+    to_image = se3.inverse(symmetry.nearest_image(T, X, S)) @ X  # g^-1
+    if batch.keys.shape[1] == 3:
+        T = se3.retract(T, np.stack([values.atVector(key) for key in batch.keys[:, 2].tolist()]))
+    root = R @ se3.adjoint(to_image)
+    return Edges(batch.kind, batch.keys[:, :2], T @ to_image, np.swapaxes(root, -1, -2) @ root)
 
 
 def camera_key(keyframe: int) -> int:
@@ -127,9 +260,10 @@ def build(
         noise: of the recorded poses.
         objects: object -> its class and chosen modes in order of time.
     """
-    built = SmootherGraph(gtsam.NonlinearFactorGraph(), gtsam.Values())
+    built = SmootherGraph()
     _add_cameras(built, cameras, noise)
     for row, (shape, measured) in objects.items():
+        built.objects[row] = shape.source.name
         _add_object(built, model, row, shape, measured, cameras)
     if model.context:
         _add_context(built, model, objects)
@@ -141,10 +275,9 @@ def smooth(
 ) -> Smoothed:
     """Solve and take the marginals; n is the number of keyframes."""
     settings = model.config.smoother
-    solution = optimise(
-        built.graph, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance
-    )
-    marginals = gtsam.Marginals(built.graph, solution.values)
+    problem = built.problem()
+    solution = optimise(problem, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
+    marginals = gtsam.Marginals(problem.linearize(solution.values), solution.values)
 
     def read(key: int) -> tuple[Array, Array]:
         return solution.values.atPose3(key).matrix(), marginals.marginalCovariance(key)
@@ -161,60 +294,82 @@ def _add_cameras(built: SmootherGraph, cameras: Sequence[Camera], noise: Localis
     sigmas = np.repeat([noise.rotation_rad, noise.translation_m], 3)
     exact = not (sigmas > 0).all()
     sigmas = np.maximum(sigmas, _EXACT)
+    drifting = []
     for k, camera in enumerate(cameras):
         pose = gtsam.Pose3(camera.T_world_camera)
         built.initial.insert(camera_key(k), pose)
-        before = cameras[k - 1] if k else None
-        if exact or before is None or before.visit != camera.visit:
+        if exact or k == 0 or cameras[k - 1].visit != camera.visit:
             model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-            built.add("localisation", gtsam.PriorFactorPose3(camera_key(k), pose, model))
+            built.add("localisation", f"camera {k}", gtsam.PriorFactorPose3(camera_key(k), pose, model))
         else:
-            rho = float(np.exp(-(camera.time_s - before.time_s) / max(noise.correlation_time_s, 1e-9)))
-            built.add("localisation", _drift_factor(k, before, camera, rho, sigmas))
+            drifting.append(k)
+    if drifting:
+        built.add_batch(_drifts(drifting, cameras, noise, sigmas))
 
 
-def _drift_factor(k: int, before: Camera, camera: Camera, rho: float, sigmas: Array) -> Any:
-    """e_k - rho e_k-1 with e = log(recorded^-1 x): a between factor knows no error that decays."""
-    inverse = [se3.inverse(c.T_world_camera) for c in (before, camera)]
-
-    def function(values: list[Array], _need: bool) -> tuple[Array, Sequence[Array]]:
-        e = [se3.log(T @ value) for T, value in zip(inverse, values, strict=True)]
-        J = [se3.right_jacobian_inverse(x) for x in e]
-        return e[1] - rho * e[0], (-rho * J[0], J[1])
-
-    fresh = sigmas * np.sqrt(max(1.0 - rho**2, 1e-6))
-    model = gtsam.noiseModel.Diagonal.Sigmas(fresh)
-    return custom_factor(f"drift {k}", (camera_key(k - 1), camera_key(k)), model, function)
+def _drifts(drifting: Sequence[int], cameras: Sequence[Camera], noise: LocalisationNoise, sigmas: Array) -> Batch:
+    """Factors between these keyframes and the ones before them."""
+    before, after = ([cameras[k - step] for k in drifting] for step in (1, 0))
+    dt = np.array([b.time_s - a.time_s for a, b in zip(before, after, strict=True)])
+    rho = np.exp(-dt / max(noise.correlation_time_s, 1e-9))
+    fresh = sigmas * np.sqrt(np.maximum(1.0 - rho**2, 1e-6))[:, None]
+    recorded = [np.stack([c.T_world_camera for c in those]) for those in (before, after)]
+    keys = np.array([(camera_key(k - 1), camera_key(k)) for k in drifting])
+    names = tuple(f"cameras {k - 1} and {k}" for k in drifting)
+    return Batch("localisation", names, keys, Drifts(recorded[0], recorded[1], rho, fresh))
 
 
 def _add_object(
     built: SmootherGraph, model: Model, row: int, shape: Shape, measured: Sequence[Measured], cameras: Sequence[Camera]
 ) -> None:
+    if not measured:
+        return
     S = shape.symmetry
-    reference: Array | None = None
-    before: Measured | None = None
-    for m in measured:
-        T = cameras[m.keyframe].T_world_camera @ m.T_camera_centre
-        # one of the equivalent poses throughout: the bias lives in the object's tangent
-        reference = T if reference is None else symmetry.nearest_image(reference, T, S)
-        key = object_key(row, m.keyframe)
-        built.initial.insert(key, gtsam.Pose3(reference))
-        _add_bias(built, model, row, m.visit)
-        mode = se3.inverse(cameras[m.keyframe].T_world_camera) @ reference
-        name = f"object {row} keyframe {m.keyframe}"
-        information = np.linalg.inv(m.covariance)
-        bias = bias_key(row, m.visit)
-        built.add(
-            "measurement",
-            mode_factor(f"mode of {name}", camera_key(m.keyframe), key, mode, information, S, key_bias=bias),
-        )
-        if S.free:
-            built.add("gauge", gauge_factor(f"gauge of {name}", key, reference, S))
-        if before is not None and m.stays:
-            sigma = model.prediction_covariance(max(m.time_s - before.time_s, 1e-3))
-            previous = object_key(row, before.keyframe)
-            built.add("prediction", prediction_factor(f"prediction of {name}", previous, key, sigma, S))
-        before = m
+    recorded = np.stack([cameras[m.keyframe].T_world_camera for m in measured])
+    # one of the equivalent poses throughout: the bias lives in the object's tangent
+    T = _one_image(recorded @ np.stack([m.T_camera_centre for m in measured]), S)
+    keys = np.array([object_key(row, m.keyframe) for m in measured])
+    names = tuple(f"object {row} keyframe {m.keyframe}" for m in measured)
+    for key, pose in zip(keys.tolist(), T, strict=True):
+        built.initial.insert(key, gtsam.Pose3(pose))
+    for visit in dict.fromkeys(m.visit for m in measured):
+        _add_bias(built, model, row, visit)
+    seen_by = [(camera_key(m.keyframe), key, bias_key(row, m.visit)) for m, key in zip(measured, keys, strict=True)]
+    information = np.linalg.inv(np.stack([m.covariance for m in measured]))
+    modes = Modes(se3.inverse(recorded) @ T, information, S)
+    built.add_batch(Batch("measurement", names, np.array(seen_by), modes))
+    if S.free:
+        built.add_batch(Batch("gauge", names, keys[:, None], Gauges(T, S)))
+    _add_predictions(built, model, S, measured, keys, names)
+
+
+def _one_image(T: Array, S: symmetry.Symmetry) -> Array:
+    """Each of the poses (n, 4, 4) written in the equivalent pose that is nearest to the one before."""
+    out = [T[0]]
+    for pose in T[1:]:
+        out.append(symmetry.nearest_image(out[-1], pose, S))
+    return np.stack(out)
+
+
+def _add_predictions(
+    built: SmootherGraph,
+    model: Model,
+    S: symmetry.Symmetry,
+    measured: Sequence[Measured],
+    keys: NDArray[np.int64],
+    names: Sequence[str],
+) -> None:
+    stays = [i for i in range(1, len(measured)) if measured[i].stays]
+    if not stays:
+        return
+    dt = [max(measured[i].time_s - measured[i - 1].time_s, 1e-3) for i in stays]
+    sigma = np.stack([model.prediction_covariance(t) for t in dt])
+    if S.free or S.order > 1:
+        pairs = np.stack([keys[[i - 1, i]] for i in stays])
+        built.add_batch(Batch("prediction", tuple(names[i] for i in stays), pairs, Predictions(sigma, S)))
+        return
+    for i, covariance in zip(stays, sigma, strict=True):
+        built.add("prediction", names[i], stay_factor(int(keys[i - 1]), int(keys[i]), covariance))
 
 
 def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
@@ -225,21 +380,22 @@ def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
     sigmas = np.repeat([settings.bias_rotation_rad, settings.bias_translation_m], 3)
     built.initial.insert(key, np.zeros(6))
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    built.add("bias", gtsam.PriorFactorVector(key, np.zeros(6), noise))
+    built.add("bias", f"object {row} visit {visit}", gtsam.PriorFactorVector(key, np.zeros(6), noise))
 
 
 def _add_context(built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]]) -> None:
     """Category context of related pairs, one fact spread over the keyframes that they share."""
-    rows = sorted(objects)
-    origin = np.zeros(3)
-    for position, a in enumerate(rows):
-        for b in rows[position + 1 :]:
-            pair = model.relations[objects[a][0].index, objects[b][0].index]
-            if pair.together <= 0.0:
-                continue
+    pairs = []
+    for a, b in combinations(sorted(objects), 2):
+        if model.relations[objects[a][0].index, objects[b][0].index].together > 0.0:
             shared = sorted({m.keyframe for m in objects[a][1]} & {m.keyframe for m in objects[b][1]})
-            for k in shared:
-                name = f"context of objects {a} and {b} keyframe {k}"
-                keys = object_key(a, k), object_key(b, k)
-                factor = context_factor(name, *keys, (origin, origin), pair, keyframes=len(shared))
-                built.add("context", factor)
+            pairs += [(a, b, k, len(shared)) for k in shared]
+    if not pairs:
+        return
+    n = len(pairs)
+    classes = np.array([(objects[a][0].index, objects[b][0].index) for a, b, _, _ in pairs])
+    related = model.relations[classes[:, 0], classes[:, 1]]
+    terms = Contexts(np.zeros((n, 2, 3)), related, np.zeros(n), np.array([shared for *_, shared in pairs]))
+    keys = np.array([(object_key(a, k), object_key(b, k)) for a, b, k, _ in pairs])
+    names = tuple(f"objects {a} and {b} keyframe {k}" for a, b, k, _ in pairs)
+    built.add_batch(Batch("context", names, keys, terms))

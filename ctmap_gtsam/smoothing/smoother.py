@@ -6,7 +6,7 @@ trellis; solve one graph of all poses; and the smoothed map is what the next rou
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,10 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
-from ctmap_gtsam.smoothing.graph import Camera, Smoothed, build, smooth
+from ctmap_gtsam.smoothing.graph import Camera, Measured, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, in_world, record
 from ctmap_gtsam.smoothing.seeding import Seed, seeds
@@ -29,6 +30,9 @@ from sequences.progress import SILENT, Progress
 from sequences.types import Run
 
 Array = NDArray[np.float64]
+Objects = Mapping[int, tuple[Shape, Sequence[Measured]]]
+Look = Callable[[SmootherGraph, Smoothed], object]
+"""Who looks at the last round's graph and its solution"""
 
 _LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care in the first round
 _SETTLED = (0.002, 0.0002)  # rad, metres: poses that move less from round to round have settled
@@ -47,7 +51,12 @@ class Map:
 
 
 def smooth_run(
-    run: Run, forward: Estimate, config: Config | None = None, *, progress: Progress | None = None
+    run: Run,
+    forward: Estimate,
+    config: Config | None = None,
+    *,
+    progress: Progress | None = None,
+    look: Look | None = None,
 ) -> Estimate:
     """The factor-graph smoother over a run, from the hypotheses of a forward pass.
 
@@ -57,6 +66,7 @@ def smooth_run(
             With a T-Map's the smoother knows nothing of relations between objects either.
         config: settings; None = the defaults.
         progress: who is told how far it is.
+        look: is handed the last round's graph and its solution, such as for `export.graph`.
 
     Returns:
         The estimate p(o_t | z_1:T) at the forward pass's keyframes.
@@ -80,6 +90,8 @@ def smooth_run(
         energies.append(dict(current.energy))
         if settled and number + 1 >= 2:
             break
+    if look is not None:
+        look(_graph(recording, model, current.things)[0], current.smoothed)
     return write(recording, model, current.things, current.smoothed, _diagnostics(proposer, current, energies))
 
 
@@ -153,6 +165,14 @@ def _solve(
     """Trellis for every object, identities over gaps, then one graph."""
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, model), recording, model)
+    built, objects = _graph(recording, model, things)
+    smoothed = smooth(built, model, objects, len(recording.keyframes))
+    things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
+    return Map(things, smoothed, built.energy(smoothed.solution.values), built.count())
+
+
+def _graph(recording: Recording, model: Model, things: Mapping[int, Thing]) -> tuple[SmootherGraph, Objects]:
+    """The graph of all that is, and what each object was taken for."""
     cameras = [
         Camera(recording.T_world_camera(k), recording.time_s(k), recording.run.frames[int(f)].visit)
         for k, f in enumerate(recording.keyframes)
@@ -161,10 +181,7 @@ def _solve(
         i: (model.shapes[thing.best_class], thing.measured(recording)) for i, thing in things.items() if thing.exists
     }
     objects = {i: entry for i, entry in objects.items() if entry[1]}
-    built = build(model, cameras, recording.run.localisation, objects)
-    smoothed = smooth(built, model, objects, len(cameras))
-    things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
-    return Map(things, smoothed, built.energy(smoothed.solution.values), built.count())
+    return build(model, cameras, recording.run.localisation, objects), objects
 
 
 def _settled(a: Map, b: Map, model: Model) -> bool:

@@ -17,6 +17,7 @@ LEVER_M = 0.1
 """how far from an object's centre its surface is, more or less: what a turn of a radian moves"""
 
 _FIRST, _GROWTH, _LAST = 1e-2, 100.0, 1e14
+_MORE = 10.0  # so much more than it fell by may a converged problem's linearisation promise
 
 End = Literal["converged", "stalled", "cap"]
 
@@ -30,7 +31,8 @@ class Solution:
     energy: float
     """graph.error at the values"""
     end: End
-    """converged: the energy fell by less than the tolerance; stalled: any damping raises it; cap: out of iterations"""
+    """converged: the energy fell by less than the tolerance, and the linearisation promises no more; stalled: any
+    damping raises it; cap: out of iterations"""
     trace: tuple[float, ...]
     """energy at the start and after every accepted step"""
 
@@ -39,19 +41,21 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
     """Minimise graph.error from `values`.
 
     Args:
-        graph: gtsam.NonlinearFactorGraph over poses and 6-vectors.
+        graph: gtsam.NonlinearFactorGraph over poses and 6-vectors, or a `batched.Problem`, which is faster.
         values: gtsam.Values, not changed.
         max_iterations: accepted steps at most.
         tolerance: relative fall of the energy at which it is converged.
     """
     energy = graph.error(values)
     trace = [energy]
-    damping = 0.0
+    damping, ordering = 0.0, None
     for _ in range(max_iterations):
         linear = graph.linearize(values)
+        ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         moved = None
         while damping < _LAST:
-            moved = _step(linear, values, damping)
+            step = _step(linear, ordering, values, damping)
+            moved = None if step is None else values.retract(step)
             after = np.inf if moved is None else graph.error(moved)
             if np.isfinite(after) and after <= energy:
                 break
@@ -59,17 +63,30 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
             damping = max(damping * _GROWTH, _FIRST)
         if moved is None:
             return Solution(values, energy, "stalled", tuple(trace))
+        little = tolerance * max(after, 1.0)
         fell = energy - after
+        trace.append(after)
+        if fell <= little:
+            # a step that is damped enough falls by little anywhere: what would a full one do?
+            full = step if damping <= _FIRST else _full_step(linear, ordering, values)
+            if full is not None and energy - linear.error(full) <= _MORE * little:
+                return Solution(moved, after, "converged", tuple(trace))
         values, energy = moved, after
-        trace.append(energy)
-        damping = 0.0 if damping <= _FIRST else damping / _GROWTH
-        if fell <= tolerance * max(energy, 1.0):
-            return Solution(values, energy, "converged", tuple(trace))
+        if fell <= little and damping <= _FIRST:
+            damping = max(damping * _GROWTH, _FIRST)  # the linearisation is far off: shorter steps
+        else:
+            damping = 0.0 if damping <= _FIRST else damping / _GROWTH
     return Solution(values, energy, "cap", tuple(trace))
 
 
-def _step(linear: Any, values: Any, damping: float) -> Any:
-    """Values after the damped step, None where the system is singular."""
+def _full_step(linear: Any, ordering: Any, values: Any) -> Any:
+    """The step with the least damping that the system can be solved with."""
+    undamped = _step(linear, ordering, values, 0.0)
+    return undamped if undamped is not None else _step(linear, ordering, values, _FIRST)
+
+
+def _step(linear: Any, ordering: Any, values: Any, damping: float) -> Any:
+    """The damped step (gtsam.VectorValues), None where the system is singular."""
     damped = linear
     if damping > 0.0:
         damped = gtsam.GaussianFactorGraph()
@@ -78,6 +95,6 @@ def _step(linear: Any, values: Any, damping: float) -> Any:
             scale = np.sqrt(damping) * np.repeat([1.0, 1.0 / LEVER_M], 3)
             damped.add(key, np.diag(scale), np.zeros(6), gtsam.noiseModel.Unit.Create(6))
     try:
-        return values.retract(damped.optimize())
+        return damped.optimize(ordering)
     except RuntimeError:
         return None

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.graph import Camera, Measured, bias_key, build, smooth
 from factors import mixture
+from factors.custom import FactorValueError
 from factors.symmetry import residual
 from sequences import se3
 from sequences.types import LocalisationNoise
@@ -176,7 +178,7 @@ def test_energies_by_kind_sum_to_the_graphs_error():
     problem = some_problem(5, 0.002)
     built, smoothed = solved(problem)
     values = smoothed.solution.values
-    assert sum(built.energy(values).values()) == pytest.approx(built.graph.error(values), abs=1e-9)
+    assert sum(built.energy(values).values()) == pytest.approx(built.to_gtsam().error(values), abs=1e-9)
     assert set(built.energy(values)) == set(built.count()) == {"localisation", "bias", "measurement", "prediction"}
     n, kept = len(problem.times), len(problem.measured)
     assert built.count() == {"localisation": n, "bias": 2, "measurement": kept, "prediction": kept - 1}
@@ -278,3 +280,44 @@ def test_a_free_turn_is_marked_wide_and_the_rest_is_not():
     reduced = shape.symmetry.reduced_covariance(covariance)
     assert np.sqrt(np.diag(reduced)).max() < 0.05
     assert np.isfinite(mixture.log_constant(np.linalg.inv(reduced)))
+
+
+@pytest.mark.parametrize("name", ["none", "box", "cylinder"])
+def test_what_the_solver_takes_is_the_gtsam_graph(name):
+    """Error and information matrix of the batches are those of one GTSAM factor each, at any values."""
+    config = config_of("context.relations.same_category.strength=0.6")
+    model = Model(classes("soup_can", "cereal_box"), config)
+    rng = np.random.default_rng(3)
+    objects = {}
+    for i, shape in enumerate(model.shapes):
+        plain = replace(SYMMETRIES[name], offsets=0 * SYMMETRIES[name].offsets)
+        _, _, modes, _, _ = tangled(i, plain)
+        objects[i] = (replace(shape, symmetry=plain), [replace(m, visit=m.keyframe // 3) for m in modes])
+    cameras = [Camera(se3.exp(0.01 * rng.normal(size=6)), 0.5 * k, k // 3) for k in range(5)]
+    built = build(model, cameras, LocalisationNoise(0.003, 0.004, 2.0), objects)
+    graph, problem = built.to_gtsam(), built.problem()
+    assert graph.size() == len(built.labels)
+    assert [tuple(graph.at(i).keys()) for i in range(graph.size())] == [label.keys for label in built.labels]
+    kinds = {"localisation", "bias", "measurement", "prediction", "context"} | (
+        {"gauge"} if name == "cylinder" else set()
+    )
+    assert built.count().keys() == kinds
+    step = gtsam.VectorValues()
+    for key in built.initial.keys():  # noqa: SIM118
+        step.insert(key, 0.02 * rng.normal(size=6))
+    values = built.initial.retract(step)
+    errors = [graph.at(i).error(values) for i in range(graph.size())]
+    np.testing.assert_allclose(built.errors(values), errors, rtol=1e-9, atol=1e-12)
+    assert problem.error(values) == pytest.approx(graph.error(values), rel=1e-12)
+    ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+    ours, theirs = (some.linearize(values).augmentedHessian(ordering) for some in (problem, graph))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
+
+
+def test_a_number_that_is_none_is_an_error_that_names_its_factor():
+    problem = some_problem(5)
+    modes = problem.modes()
+    broken = replace(modes[2], T_camera_centre=np.full((4, 4), np.nan))
+    built = build(MODEL, problem.cameras(), problem.noise, {3: (MUG, [*modes[:2], broken, *modes[3:]])})
+    with pytest.raises(FactorValueError, match=f"object 3 keyframe {modes[2].keyframe}"):
+        built.problem().linearize(built.initial)

@@ -149,3 +149,29 @@ def test_a_narrow_curved_valley_is_followed_to_its_end_or_not_called_converged(x
     assert solution.end in ("converged", "cap")
     if solution.end == "converged":
         assert solution.energy < 1e-4
+
+
+def test_a_step_that_changes_nothing_though_much_is_promised_is_not_convergence():
+    """Newton's method on the root of |x| jumps from x to -x for ever."""
+
+    def function(x):
+        return np.sqrt(np.abs(x))
+
+    def jacobian(x):
+        return np.diag(np.sign(x) / (2.0 * np.sqrt(np.abs(x))))
+
+    graph, values = vector_problem(function, jacobian, np.full(6, 2.0))
+    solution = optimise(graph, values, max_iterations=60, tolerance=1e-6)
+    assert solution.end in ("cap", "stalled") or solution.energy < 1e-3
+    assert optimise(graph, values, max_iterations=1, tolerance=1e-6).end == "cap"
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 2**31), st.sampled_from([0.3, 1.5, 3.0]))
+def test_where_it_converged_the_linearisation_promises_no_more(seed, scale):
+    graph, values = noisy_chain(seed, scale=scale)
+    solution = optimise(graph, values, max_iterations=60, tolerance=1e-6)
+    if solution.end == "converged":
+        linear = graph.linearize(solution.values)
+        promised = solution.energy - linear.error(linear.optimize())
+        assert promised <= 1e-4 * max(solution.energy, 1.0)

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 
 from factors import context, custom, measurement, mixture, prediction
+from factors.terms import Contexts, Gauges, Modes, Predictions
 from sequences import se3
 from tests.factors.strategies import SEEDS, SYMMETRIES, random_image, random_pose, random_spd, random_tangent
 
@@ -43,11 +44,25 @@ def test_prediction_factor(symmetry, seed):
     T_a = random_pose(rng)
     T_b = T_a @ se3.exp(random_tangent(rng, 0.5, 1.0)) @ random_image(rng, symmetry)
     sigma = prediction.covariance(0.2, 0.1, 0.5, symmetry)
-    factor = custom.prediction_factor("prediction", A, B, sigma, symmetry)
+    factor = custom.terms_factor("prediction", (A, B), Predictions(sigma, symmetry))
     values = values_of({A: T_a, B: T_b})
     log_potential = prediction.log_potential(T_a, T_b, sigma, symmetry)
-    assert factor.error(values) + factor.noiseModel().negLogConstant() == pytest.approx(-log_potential)
+    constant = mixture.log_constant(np.linalg.inv(symmetry.reduced_covariance(sigma)))
+    assert constant - factor.error(values) == pytest.approx(log_potential)
     assert_linearised(factor, values)
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_gtsams_between_factor_says_what_a_prediction_without_symmetry_says(seed):
+    rng = np.random.default_rng(seed)
+    T_a = random_pose(rng)
+    values = values_of({A: T_a, B: T_a @ se3.exp(random_tangent(rng, 1.0, 2.5))})
+    sigma = np.linalg.inv(random_spd(rng))
+    ours, theirs = custom.terms_factor("stays", (A, B), Predictions(sigma)), custom.stay_factor(A, B, sigma)
+    assert ours.error(values) == pytest.approx(theirs.error(values), rel=1e-9)
+    information = [factor.linearize(values).augmentedInformation() for factor in (ours, theirs)]
+    assert np.allclose(information[0], information[1], rtol=1e-9, atol=1e-9 * np.abs(information[0]).max())
 
 
 @each_symmetry
@@ -59,7 +74,7 @@ def test_mode_factor(symmetry, with_bias, seed):
     camera, mode, information = random_pose(rng), random_pose(rng), np.diag([9.0, 9, 9, 25, 25, 25])
     placed = camera @ mode @ se3.exp(random_tangent(rng, 0.3, 1.0)) @ random_image(rng, symmetry)
     bias = 0.1 * rng.standard_normal(6) if with_bias else None
-    factor = custom.mode_factor("mode", A, B, mode, information, symmetry, BIAS if with_bias else None)
+    factor = custom.terms_factor("mode", (A, B, BIAS) if with_bias else (A, B), Modes(mode, information, symmetry))
     values = values_of({A: camera, B: placed} | ({BIAS: bias} if with_bias else {}))
     log_potential = measurement.mode_log_potential(camera, placed, mode, information, bias, symmetry)
     constant = mixture.log_constant(symmetry.reduced_information(information))
@@ -70,9 +85,8 @@ def test_mode_factor(symmetry, with_bias, seed):
 def test_a_flat_direction_of_a_mode_stays_free():
     rng = np.random.default_rng(0)
     camera, mode = random_pose(rng), random_pose(rng)
-    factor = custom.mode_factor("flat", A, B, mode, np.diag([0.0, 4, 4, 9, 9, 9]))
+    factor = custom.terms_factor("flat", (A, B), Modes(mode, np.diag([0.0, 4, 4, 9, 9, 9])))
     turned = values_of({A: camera, B: camera @ mode @ se3.exp(np.r_[0.7, np.zeros(5)])})
-    assert factor.dim() == 5
     assert factor.error(turned) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -83,7 +97,8 @@ def test_context_factor(seed):
     T_a, T_b, centres = random_pose(rng), random_pose(rng), rng.normal(0, 0.1, (2, 3))
     pair = context.pair_mixture(context.Relation(0.4, 0.5, 0.8), 6.0)
     instance, keyframes = 0.3, 7
-    factor = custom.context_factor("context", A, B, (centres[0], centres[1]), pair, instance, keyframes)
+    terms = Contexts(centres, pair, np.array(instance), np.array(keyframes))
+    factor = custom.terms_factor("context", (A, B), terms)
     values = values_of({A: T_a, B: T_b})
     distance = context.pair_distance(T_a, T_b, *centres)
     peak = context.context_residual(distance, pair, instance)[2]
@@ -98,10 +113,10 @@ def test_the_gauge_lets_elimination_through_and_holds_nothing_else():
     placed = camera @ mode @ se3.exp(random_tangent(rng, 0.1))
     graph, values = gtsam.NonlinearFactorGraph(), values_of({A: camera, B: placed})
     graph.add(gtsam.PriorFactorPose3(A, gtsam.Pose3(camera), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
-    graph.add(custom.mode_factor("mode", A, B, mode, 1e4 * np.eye(6), symmetry))
+    graph.add(custom.terms_factor("mode", (A, B), Modes(mode, 1e4 * np.eye(6), symmetry)))
     with pytest.raises(RuntimeError, match=r"Indeterminate"):
         gtsam.Marginals(graph, values).marginalCovariance(B)
-    graph.add(custom.gauge_factor("gauge", B, placed, symmetry))
+    graph.add(custom.terms_factor("gauge", (B,), Gauges(placed, symmetry)))
     assert_linearised(graph.at(2), values)
     covariance = gtsam.Marginals(graph, values).marginalCovariance(B)
     free = symmetry.reader @ covariance @ symmetry.reader.T
@@ -118,10 +133,12 @@ def test_a_chain_of_modes_and_predictions_finds_its_object():
         camera, key, object_key = random_pose(rng), gtsam.symbol("x", k), gtsam.symbol("o", k)
         graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(camera), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
         seen = se3.inverse(camera) @ truth @ random_image(rng, symmetry)
-        graph.add(custom.mode_factor(f"mode {k}", key, object_key, seen, random_spd(rng) * 1e3, symmetry))
+        modes = Modes(seen, random_spd(rng) * 1e3, symmetry)
+        graph.add(custom.terms_factor(f"mode {k}", (key, object_key), modes))
         if k:
             sigma = prediction.covariance(1e-4, 1e-6, 1.0, symmetry)
-            graph.add(custom.prediction_factor("still", gtsam.symbol("o", k - 1), object_key, sigma, symmetry))
+            keys = (gtsam.symbol("o", k - 1), object_key)
+            graph.add(custom.terms_factor("still", keys, Predictions(sigma, symmetry)))
         values.insert(key, gtsam.Pose3(camera))
         start = truth @ se3.exp(np.r_[np.radians(20) * se3.so3_log(random_pose(rng)[:3, :3]) / 3, 0.03, -0.03, 0.03])
         values.insert(object_key, gtsam.Pose3(start))

@@ -98,10 +98,10 @@ def test_moments_of_a_mixture_of_poses(seed):
 def test_the_square_root_keeps_the_rank(seed, rank):
     rng = np.random.default_rng(seed)
     half = rng.standard_normal((rank, 6))
-    root = mixture.square_root(half.T @ half, relative_floor=1e-9)
-    assert root.shape == (rank, 6)
-    assert np.allclose(root.T @ root, half.T @ half, atol=1e-9)
-    assert mixture.square_root(np.zeros((6, 6))).shape == (0, 6)
+    information = np.stack([half.T @ half, np.eye(6), np.zeros((6, 6))])
+    root = mixture.square_root(information, relative_floor=1e-9)
+    assert root.any(axis=-1).sum(axis=-1).tolist() == [rank, 6, 0]
+    assert np.allclose(np.swapaxes(root, -1, -2) @ root, information, atol=1e-9)
 
 
 def test_the_null_mode_is_broad():

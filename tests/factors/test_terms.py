@@ -1,0 +1,81 @@
+"""Laws of factors evaluated together: each is what it is alone."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from factors import context, prediction
+from factors.terms import Contexts, Drifts, Gauges, Modes, Predictions
+from sequences import se3
+from tests.factors.strategies import SEEDS, SYMMETRIES, numerical_jacobian, random_image, random_pose, random_spd
+
+N = 7
+each_symmetry = pytest.mark.parametrize("symmetry", SYMMETRIES.values(), ids=SYMMETRIES.keys())
+
+
+def some(rng, make, *arguments):
+    return np.stack([make(rng, *arguments) for _ in range(N)])
+
+
+def assert_one_by_one(terms, values):
+    r, jacobians = terms.linearised(values)
+    assert r.shape == (N, terms.rows)
+    assert len(jacobians) == len(values)
+    for i in range(N):
+        alone, alone_jacobians = terms[i].linearised([value[i] for value in values])
+        np.testing.assert_allclose(r[i], alone, rtol=1e-10, atol=1e-12)
+        for J, alone_J in zip(jacobians, alone_jacobians, strict=True):
+            assert J[i].shape == (terms.rows, 6)
+            np.testing.assert_allclose(J[i], alone_J, rtol=1e-9, atol=1e-10 * max(1.0, np.abs(alone_J).max()))
+
+
+def near(rng, T, scale=0.3):
+    return se3.retract(T, scale * rng.uniform(-1, 1, (len(T), 6)))
+
+
+@each_symmetry
+@given(SEEDS)
+@settings(max_examples=3)
+def test_modes_predictions_and_gauges(symmetry, seed):
+    rng = np.random.default_rng(seed)
+    cameras, modes = some(rng, random_pose), some(rng, random_pose)
+    placed = near(rng, cameras @ modes) @ some(rng, random_image, symmetry)
+    information, bias = some(rng, random_spd), 0.1 * rng.normal(size=(N, 6))
+    assert_one_by_one(Modes(modes, information, symmetry), [cameras, placed, bias])
+    assert_one_by_one(Modes(modes, information, symmetry), [cameras, placed])
+    sigma = prediction.covariance(0.2, 0.1, rng.uniform(0.1, 3.0, N), symmetry)
+    assert_one_by_one(Predictions(sigma, symmetry), [placed, near(rng, placed)])
+    if symmetry.free:
+        assert_one_by_one(Gauges(placed, symmetry), [near(rng, placed)])
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_drifts(seed):
+    rng = np.random.default_rng(seed)
+    recorded = some(rng, random_pose), some(rng, random_pose)
+    terms = Drifts(*recorded, rng.uniform(0, 1, N), rng.uniform(0.1, 1.0, (N, 6)))
+    values = [near(rng, T) for T in recorded]
+    assert_one_by_one(terms, values)
+    e = [se3.local(T, value) for T, value in zip(recorded, values, strict=True)]
+    expected = (e[1] - terms.rho[:, None] * e[0]) / terms.sigma
+    r, jacobians = terms.linearised(values)
+    np.testing.assert_allclose(r, expected, atol=1e-10)
+    for j in range(2):
+
+        def alone(T, j=j):
+            some_values = [T if i == j else np.broadcast_to(value[0], T.shape) for i, value in enumerate(values)]
+            return terms[0].linearised(some_values)[0]
+
+        np.testing.assert_allclose(jacobians[j][0], numerical_jacobian(alone, values[j][0]), atol=1e-6)
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_contexts_of_different_pairs(seed):
+    rng = np.random.default_rng(seed)
+    relations = [context.pair_mixture(context.Relation(p, 0.5, 0.8), 6.0) for p in rng.uniform(0.1, 0.9, N)]
+    parts = np.array([(p.strangers, p.together, p.usual_m, p.sigma_m) for p in relations]).T
+    pairs = context.PairMixture(*parts, relations[0].instance_weight)
+    terms = Contexts(rng.normal(0, 0.1, (N, 2, 3)), pairs, rng.normal(size=N), rng.integers(1, 9, N))
+    assert_one_by_one(terms, [some(rng, random_pose), some(rng, random_pose)])
