@@ -122,14 +122,11 @@ class Model:
 
         A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1).
         """
-        return self.kappa * scores.log_ratio + self._detection(scores, detection, image_size)
-
-    def _detection(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
         boxes = None
         if detection is not None:
             rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
             boxes = self.box(np.array(detection.box), rendered, image_size)
-        return self.detection(_shares(scores), boxes)
+        return self.kappa * scores.log_ratio + self.detection(_shares(scores), boxes)
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
@@ -167,16 +164,22 @@ class Model:
         box = np.array(detection.box)
         return np.full(len(visible), np.log(rate) + float(self.box(box, box[None], image_size)[0]) - _EDGES)
 
-    def witness(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
-        """What a box, or that there is none, says (K,) for a known thing at poses (K,) against a look-alike, nats.
+    def witness(self, scores: Scores, detected: bool) -> Array:
+        """What a track's box in a view, or the lack of one, says (K,) for a known thing against a look-alike, nats.
+
+        Known things are found in most views. How well the box fits says nothing: the look-alike's would fit as well.
 
         Args:
-            scores: of the poses.
-            detection: the track's box in this view; None where it has none.
-            image_size: width and height, pixels.
+            scores: of poses (K).
+            detected: whether there is a box.
         """
-        known = self._detection(scores, detection, image_size)
-        return known - self.clutter_detection(_shares(scores), detection, image_size)
+        d, visible = self.config.detector, _shares(scores)
+        if detected:
+            # a box where next to nothing shows is another thing's
+            return np.log(
+                (d.detection_probability * visible + d.box_outlier) / (d.clutter_rate * visible + d.box_outlier)
+            )
+        return np.log1p(-d.detection_probability * visible) - np.log1p(-d.clutter_rate * visible)
 
     def existence(
         self,

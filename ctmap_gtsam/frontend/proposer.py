@@ -216,7 +216,7 @@ class Proposer:
         return float(self._witness(view, self.score(shape, view, T_camera_centre[None])[1])[0])
 
     def _witness(self, view: View, scores: Scores) -> Array:
-        return view.share * self.model.witness(scores, view.detection, view.image_size)
+        return view.share * self.model.witness(scores, view.detection is not None)
 
     def near(self, shape: Shape, view: View, T_camera_centre: Array, reach: Array) -> float:
         """The best log-likelihood of a view about one pose (4, 4): there, or where depth draws it, if that is in reach.

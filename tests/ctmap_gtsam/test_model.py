@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctmap_gtsam.frontend.scoring import Scores
-from sequences.types import Detection, LocalisationNoise
+from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
 
 MODEL = model_of("mug", "soup_can", "cereal_box")
@@ -71,10 +71,8 @@ def test_being_missed_in_view_speaks_for_a_look_alike_and_being_out_of_sight_for
         Scores(np.zeros(1), np.full(1, 100.0), np.full(1, 100.0 * v), np.array([[10.0, 10.0, 50.0, 60.0]]))
         for v in (0.0, visible)
     )
-    assert MODEL.witness(unseen, None, (640, 480))[0] == 0.0
-    assert MODEL.witness(seen, None, (640, 480))[0] < 0.0
-    found = Detection((10.0, 10.0, 40.0, 50.0), np.array([0.1, 0.3, 0.3, 0.3]))
-    assert MODEL.witness(seen, found, (640, 480))[0] > MODEL.witness(seen, None, (640, 480))[0]
+    assert MODEL.witness(unseen, False)[0] == MODEL.witness(unseen, True)[0] == 0.0
+    assert MODEL.witness(seen, False)[0] < 0.0 < MODEL.witness(seen, True)[0]
 
 
 @given(st.floats(0.0, 0.1), st.floats(0.0, 0.1), st.floats(0.1, 5.0))
