@@ -13,6 +13,7 @@ from ctmap_gtsam.baselines.detected import register_detections
 from ctmap_gtsam.baselines.fusion import static_fusion
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.filtering.backward import backward_run
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.literal import literal_filter_run
 from ctmap_gtsam.smoothing.smoother import Look, smooth_run
@@ -62,6 +63,10 @@ def _literal(run: Run, config: Config, progress: Progress, *, context: bool) -> 
     return literal_filter_run(run, config, context=context, progress=progress)
 
 
+def _backward(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
+    return backward_run(run, config, context=context, progress=progress)
+
+
 def _smooth(run: Run, config: Config, progress: Progress, forward: Estimate, look: Look | None = None) -> Estimate:
     return smooth_run(run, forward, config, progress=progress, look=look)
 
@@ -88,6 +93,8 @@ METHODS: dict[str, Method] = {
                partial(_filter, context=False), _needs_detections),
         Method("filter-ct", "CT-Map: the particle filter, each frame seeing the past", "estimate",
                partial(_filter, context=True), _needs_detections),
+        Method("ffbsi-ct", "trajectories drawn back through filter-ct's particles: a smoother without a graph",
+               "estimate", partial(_backward, context=True), _needs_detections),
         Method("last-copied-back", "filter-ct's last map of each visit in all of the visit's frames", "estimate",
                copy_back, _needs_detections, needs=("filter-ct",)),
         Method("smooth-t", "the factor-graph smoother without context, from filter-t's objects", "estimate",

@@ -122,6 +122,7 @@ class Filter:
     )
     search_every: int = option(5, "keyframes between fresh searches", low=1)
     search_share: float = option(0.25, "effort of such a search, as a share of the first one's", low=0.0, high=1.0)
+    trajectories: int = option(300, "a class and object drawn back through the particles, for ffbsi-ct", low=10)
 
 
 @dataclass(frozen=True)

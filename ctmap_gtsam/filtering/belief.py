@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.building import Tables
+from ctmap_gtsam.filtering.history import Kept, Past, Stage
 from ctmap_gtsam.filtering.memory import Memory
 from ctmap_gtsam.filtering.particles import (
     MODE_RADIUS,
     Gaussians,
     Particles,
     Spread,
+    Transition,
     modes_of,
     predict,
     predicted_log_density,
@@ -40,7 +42,9 @@ _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighe
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
 _LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
 _IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
-_REPORTED = 0.01  # classes less probable than this are not reported with poses
+
+REPORTED = 0.01
+"""classes less probable than this are not reported with poses"""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class ClassBelief:
     particles: Particles
     log_evidence: float
     """log p(depth and boxes so far, at this place | class) against nothing being there"""
+    transition: Transition | None = None
+    """from the particles before; None where these don't come from them"""
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,8 @@ class Belief:
     searched: int = 1
     """steps when it was last searched for"""
     memory: Memory = field(default_factory=Memory)
+    past: Past | None = None
+    """for the backward pass; None where nobody goes back"""
 
     def class_log_evidence(self, model: Model) -> Array:
         """(C,) log evidence of each class at this place, prior included."""
@@ -160,12 +168,15 @@ class Reported:
 
 
 class Updater:
-    """Starts, steps and reports beliefs."""
+    """Starts, steps and reports beliefs; `keep_past` lets them keep what a backward pass needs."""
 
-    def __init__(self, model: Model, proposer: Proposer, localisation: LocalisationNoise) -> None:
+    def __init__(
+        self, model: Model, proposer: Proposer, localisation: LocalisationNoise, *, keep_past: bool = False
+    ) -> None:
         self.model = model
         self.proposer = proposer
         self.localisation = localisation
+        self.keep_past = keep_past
 
     def search(self, track: Track, observation: Observation, around: Surroundings) -> tuple[PoseModes, ...]:
         """A full search for a track that has just become consistent: what was found of each class."""
@@ -212,7 +223,8 @@ class Updater:
         )
         memory = Memory().joined(view, observation.frame.T_camera_world)
         fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation), memory=memory)
-        return self._rivalled(fresh, view, observation)
+        fresh = self._rivalled(fresh, view, observation)
+        return self._kept(fresh, None, Past(track.keyframes[0]), observation)
 
     def _first_view(self, track: Track, observation: Observation, around: Surroundings) -> View:
         detection = track.at(observation.keyframe)
@@ -247,7 +259,28 @@ class Updater:
             searched=belief.steps if search else belief.searched,
             memory=belief.memory.joined(view, observation.frame.T_camera_world),
         )
-        return self._rivalled(moved, view, observation)
+        moved = self._rivalled(moved, view, observation)
+        return self._kept(moved, belief, belief.past, observation)
+
+    def _kept(self, belief: Belief, before: Belief | None, past: Past | None, observation: Observation) -> Belief:
+        """The belief with what is to be kept of this keyframe: the classes that were weighed."""
+        if not self.keep_past or past is None:
+            return belief
+        old = (None,) * len(belief.classes) if before is None else before.classes
+        weighed = {
+            c: Kept.of(own.particles, own.transition)
+            for c, (own, was) in enumerate(zip(belief.classes, old, strict=True))
+            if own is not None and (was is None or own.particles is not was.particles)
+        }
+        stage = Stage(
+            keyframe=observation.keyframe,
+            time_ns=observation.frame.time_ns,
+            away_m=float(np.linalg.norm(belief.viewpoint)),
+            classes=weighed,
+            log_evidence=belief.class_log_evidence(self.model),
+            log_clutter=belief.log_clutter,
+        )
+        return replace(belief, past=past.joined(stage))
 
     def report(self, belief: Belief, around: Surroundings) -> Reported:
         """The posterior, the context multiplied in once."""
@@ -273,7 +306,7 @@ class Updater:
         shared = np.diag(self.model.shared_variance(self.localisation, float(np.linalg.norm(belief.viewpoint))))
         modes: list[tuple[int, float, Array, Array, Array]] = []
         for c, particles in enumerate(weighted):
-            if particles is not None and (probability[c] > _REPORTED or c == int(np.argmax(probability))):
+            if particles is not None and (probability[c] > REPORTED or c == int(np.argmax(probability))):
                 found = modes_of(c, particles, self.model.shapes[c])
                 modes += [(c, log_weight, T, covariance + shared, free) for _, log_weight, T, covariance, free in found]
         best = int(np.argmax(probability))
@@ -407,7 +440,10 @@ class Updater:
         if effort.standard is not None and proposals is not None:
             own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
         spread = self._spread(observation, belief.time_ns, starts)
-        return self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)
+        stepped = self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)
+        if stepped is None or own is belief.classes[shape.index]:
+            return stepped
+        return replace(stepped, transition=None)  # a pose found late has no past among the particles
 
     def _reconsider(
         self,
@@ -444,13 +480,9 @@ class Updater:
 
     def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
         """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
-        dt = max((observation.frame.time_ns - before_ns) * 1e-9, 1e-3)
-        walked = np.diag(self.model.prediction_covariance(dt))
-        # two recorded poses that lie closer than the correlation time err together
-        apart = 2.0 * (1.0 - np.exp(-dt / max(self.localisation.correlation_time_s, 1e-9)))
+        dt = (observation.frame.time_ns - before_ns) * 1e-9
         away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
-        turned, moved = localisation_variance(self.localisation, away)
-        return Spread(float(np.sqrt(walked[0] + apart * turned)), float(np.sqrt(walked[3] + apart * moved)))
+        return predicted_spread(self.model, self.localisation, dt, away)
 
     def _weigh(
         self,
@@ -478,6 +510,7 @@ class Updater:
         T = np.concatenate(drawn)
         score, scores = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
         log_prior = log_drawn = np.full(len(T), log_uniform)
+        transition = None
         if own is not None and spread is not None:
             # nobody pushes a cupboard; if it seems to be elsewhere it was never found, which a search can mend
             jump = self.model.config.prediction.jump_probability if shape.source.movable else 0.0
@@ -486,6 +519,7 @@ class Updater:
             # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
             seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
             log_prior = np.where(seen, log_drawn, stayed)
+            transition = Transition(spread, np.asarray(seen & (jump > 0.0)))
             # the prediction's tails end somewhere, or thousands of nats of depth buy any distance
             log_prior = np.where(self._nearby(own.particles, T), log_prior, -np.inf)
         log_q = log_drawn
@@ -496,7 +530,7 @@ class Updater:
         log_weight = log_prior + score - log_q
         gained = float(log_sum(log_weight)) - np.log(len(T))
         before = 0.0 if own is None else own.log_evidence
-        return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained)
+        return ClassBelief(Particles(T, mixture.normalised(log_weight)), before + gained, transition)
 
     def _nearby(self, particles: Particles, T_world_centre: Array) -> NDArray[np.bool_]:
         """Which poses (K, 4, 4) a push can bring about; a box farther away is another thing's."""
@@ -528,3 +562,13 @@ class Updater:
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
+
+
+def predicted_spread(model: Model, localisation: LocalisationNoise, dt_s: float, away_m: float) -> Spread:
+    """Sigma = Q dt, and by how much localisation may have gone off in between, at a distance from the camera."""
+    dt = max(dt_s, 1e-3)
+    walked = np.diag(model.prediction_covariance(dt))
+    # two recorded poses that lie closer than the correlation time err together
+    apart = 2.0 * (1.0 - np.exp(-dt / max(localisation.correlation_time_s, 1e-9)))
+    turned, moved = localisation_variance(localisation, away_m)
+    return Spread(float(np.sqrt(walked[0] + apart * turned)), float(np.sqrt(walked[3] + apart * moved)))

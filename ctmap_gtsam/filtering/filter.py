@@ -18,6 +18,7 @@ from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
+from ctmap_gtsam.filtering.history import one_past
 from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
@@ -49,27 +50,33 @@ def filter_run(
     Returns:
         The estimate p(o_t | z_1:t) at every keyframe.
     """
-    config = config or Config()
+    return _estimate(run, forward(run, config or Config(), context=context, progress=progress or SILENT))
+
+
+def forward(
+    run: Run, config: Config, *, context: bool = True, progress: Progress = SILENT, keep_past: bool = False
+) -> Forward:
+    """The filter's pass over a run; `keep_past` for what is to go back over it."""
     model = Model(run.catalogue, config, context=context)
     keyframes = select_keyframes(run, config.keyframes)
-    proposer = Proposer(model)
-    state = _State(run, model, proposer)
-    with (progress or SILENT).stage("filter-ct" if context else "filter-t", total=len(keyframes)) as stage:
+    state = Forward(run, model, keyframes, keep_past=keep_past)
+    with progress.stage("filter-ct" if context else "filter-t", total=len(keyframes)) as stage:
         for observation in observations(run, keyframes, config.seed):
             state.step(observation)
             stage.advance()
-    return _estimate(run, model, keyframes, state)
+    return state
 
 
-class _State:
+class Forward:
     """All beliefs after a keyframe, and what has been reported."""
 
-    def __init__(self, run: Run, model: Model, proposer: Proposer) -> None:
+    def __init__(self, run: Run, model: Model, keyframes: NDArray[np.int64], *, keep_past: bool = False) -> None:
         self.model = model
-        self.proposer = proposer
+        self.keyframes = keyframes
+        self.proposer = Proposer(model)
         self.associator = Associator(model.config.frontend, model.catalogue)
         self.place = Place(run)
-        self.updater = Updater(model, proposer, run.localisation)
+        self.updater = Updater(model, self.proposer, run.localisation, keep_past=keep_past)
         self.beliefs: dict[int, Belief] = {}
         self.owner: dict[int, int] = {}
         """track -> object"""
@@ -84,7 +91,7 @@ class _State:
         self.associator.step(observation)
         self.place.update(observation)
         before = self.reports[-1] if self.reports else {}
-        surroundings = self._surroundings(before)
+        surroundings = self.surroundings(before)
         tracks = self.associator.tracks()
         reported: dict[int, Reported] = {}
         for i, detection in self._detections(tracks, observation).items():
@@ -130,10 +137,10 @@ class _State:
         """
         started: dict[int, Belief] = {}
         fresh: dict[int, Reported] = {}
-        alone = self._surroundings(before)
+        alone = self.surroundings(before)
         found = {track.track_id: self.updater.search(track, observation, alone) for track in new}
         for _ in range(2 if len(new) > 1 else 1):
-            surroundings = self._surroundings({**before, **fresh})
+            surroundings = self.surroundings({**before, **fresh})
             for track in new:
                 i = track.track_id
                 started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
@@ -143,7 +150,8 @@ class _State:
             known = at_place(report, there, self.model)
             owner = self.owner[i] = i if known is None else known
             if known is None or there[known].existence < min(0.5, report.existence):
-                self.beliefs[owner] = replace(started[i], object_id=owner)
+                past = one_past(started[i].past, self.beliefs[owner].past if owner in self.beliefs else None)
+                self.beliefs[owner] = replace(started[i], object_id=owner, past=past)
                 there[owner] = report
         return there
 
@@ -157,7 +165,9 @@ class _State:
                 continue
             old, young = sorted((i, same), key=lambda j: (self.beliefs[j].first_ns, j))
             kept[old] = kept.pop(same)
-            self.beliefs[old] = replace(self.beliefs[same], object_id=old, first_ns=self.beliefs[old].first_ns)
+            more, less = self.beliefs[same], self.beliefs[i]
+            past = one_past(more.past, less.past)
+            self.beliefs[old] = replace(more, object_id=old, first_ns=self.beliefs[old].first_ns, past=past)
             del self.beliefs[young]
             self.owner |= {track: old for track, owner in self.owner.items() if owner == young}
         return dict(sorted(kept.items()))
@@ -173,7 +183,8 @@ class _State:
             reported[i] = reported.pop(found)
         return reported
 
-    def _surroundings(self, reports: Mapping[int, Reported]) -> Surroundings:
+    def surroundings(self, reports: Mapping[int, Reported]) -> Surroundings:
+        """What stands around, by what was reported."""
         return Surroundings(self._neighbours(reports), self.place.surfaces)
 
     def _neighbours(self, reports: Mapping[int, Reported]) -> tuple[Neighbour, ...]:
@@ -187,7 +198,8 @@ class _State:
         )
 
 
-def _estimate(run: Run, model: Model, keyframes: NDArray[np.int64], state: _State) -> Estimate:
+def _estimate(run: Run, state: Forward) -> Estimate:
+    model, keyframes = state.model, state.keyframes
     objects = sorted({i for reported in state.reports for i in reported})
     rows = {i: row for row, i in enumerate(objects)}
     tables = Tables(len(objects), len(keyframes), len(model.catalogue))
@@ -212,7 +224,7 @@ def _estimate(run: Run, model: Model, keyframes: NDArray[np.int64], state: _Stat
     )
 
 
-def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame], state: _State) -> None:
+def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame], state: Forward) -> None:
     """A line for each gap between views that is long enough to hold a move, by what is believed when its visit ends."""
     times = np.array([frame.time_ns for frame in frames])
     for i, between, same in state.found_moved:

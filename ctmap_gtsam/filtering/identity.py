@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ctmap_gtsam.filtering.belief import Belief, Reported
+from ctmap_gtsam.filtering.history import moved_past
 from ctmap_gtsam.model import Model
 from factors import mixture
 
@@ -79,4 +80,10 @@ def _one_class(gone: Belief, gone_report: Reported, found: Belief, found_report:
 def as_moved(old: Belief, found: Belief, model: Model) -> Belief:
     """The belief of an object at its new place: what was known of its class is still known."""
     known = np.maximum(mixture.normalised(old.class_log_evidence(model)), _FORGOTTEN) + np.log(len(old.classes))
-    return replace(found, object_id=old.object_id, score_evidence=found.score_evidence + known, first_ns=old.first_ns)
+    return replace(
+        found,
+        object_id=old.object_id,
+        score_evidence=found.score_evidence + known,
+        first_ns=old.first_ns,
+        past=moved_past(found.past, old.past),
+    )

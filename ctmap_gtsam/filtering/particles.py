@@ -63,6 +63,15 @@ class Spread:
 
 
 @dataclass(frozen=True)
+class Transition:
+    """The prior under which M particles were weighed, given those before them."""
+
+    spread: Spread
+    may_jump: NDArray[np.bool_]
+    """(M,) which of them may also come from anywhere nearby"""
+
+
+@dataclass(frozen=True)
 class Gaussians:
     """Proposals around modes: n poses with covariances of their right tangents."""
 
@@ -105,16 +114,29 @@ def predict(particles: Particles, n: int, spread: Spread, shape: Shape, rng: np.
 
 def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape: Shape) -> Array:
     """log sum_k w_k phi_p(x | x_k) (K,) at poses (K, 4, 4), over poses modulo the object's symmetries."""
+    squared, constant = _squared_steps(particles.T_world_centre, T, spread, shape)
+    exponent = (particles.log_weight - 0.5 * squared).reshape(len(T), -1)
+    return logsumexp(exponent, axis=-1) - constant
+
+
+def transition_log_density(T_before: Array, T: Array, spread: Spread, shape: Shape) -> Array:
+    """log phi_p(x | x_k) (K, M) of poses (K, 4, 4) given each pose before (M, 4, 4), modulo the object's symmetries."""
+    squared, constant = _squared_steps(T_before, T, spread, shape)
+    images = squared.reshape(len(T), -1, len(T_before))
+    return logsumexp(-0.5 * images, axis=1) - constant
+
+
+def _squared_steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Array, float]:
+    """-2 times the exponents of phi_p for every image of every pose (K S, M), and the log of its normaliser."""
     S = shape.symmetry
     # a pose and its predecessor may be written in different equivalent poses: sum over all of them
     images = (T[:, None] @ S.discrete).reshape(-1, 4, 4)
-    a, b = _features(particles.T_world_centre, shape, spread), _features(images, shape, spread)
+    a, b = _features(T_before, shape, spread), _features(images, shape, spread)
     squared = np.maximum((b**2).sum(-1)[:, None] + (a**2).sum(-1) - 2.0 * b @ a.T, 0.0)
     turns = 3 - S.free
     constant = turns * (np.log(spread.rotation_rad) + 0.5 * LOG_2PI)
     constant += 3 * (np.log(spread.translation_m) + 0.5 * LOG_2PI)
-    exponent = (particles.log_weight - 0.5 * squared).reshape(len(T), -1)
-    return logsumexp(exponent, axis=-1) - constant
+    return squared, float(constant)
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:

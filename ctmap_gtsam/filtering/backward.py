@@ -1,0 +1,437 @@
+"""The particle smoother: forward filtering, backward simulation (Godsill, Doucet and West, J. Am. Stat. Assoc. 2004).
+
+The filter runs forward and keeps its particles. Then trajectories are drawn from the last keyframe to the first: given
+where a trajectory is at one keyframe, it was at particle j of the keyframe before with probability
+
+    w_j p(x_next | x_j) / sum_l w_l p(x_next | x_l)
+
+with the transition p that the forward pass weighed with: the prediction in view, and a small part that comes from
+anywhere nearby. What is reported of a keyframe are the means of these probabilities over all trajectories (the draws
+but for the last, Rao-Blackwellised), a weighted particle set as the filter's. The class is not drawn: it has its own
+particles, and its posterior is that of the last keyframe, which has seen the whole run. No image is looked at again.
+
+Beside that, whether the thing was there at all: either it still is at the end, as the filter says then, or it was taken
+away after one of the keyframes (Equation 3 in absences, the chance of a push in view) or never was there; each with the
+evidence that the filter had collected by then, since what comes later says nothing for one that has gone.
+
+What has no past among the particles is carried back by the prediction alone: a pose that a search found late and that
+explained the views kept before better, and an object before its track was consistent. It is carried to its first box,
+and on to the beginning of that visit, where it stood with Equation 3's probability for the time until the first box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
+from ctmap_gtsam.config import Config
+from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.filtering.belief import REPORTED, Reported, predicted_spread
+from ctmap_gtsam.filtering.filter import Forward, forward
+from ctmap_gtsam.filtering.history import Kept, Past, Stage
+from ctmap_gtsam.filtering.particles import Particles, Spread, modes_of, systematic, transition_log_density
+from ctmap_gtsam.frontend.place import describe
+from ctmap_gtsam.frontend.visibility import outlook
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
+from factors import mixture
+from factors.mixture import log_sum
+from sequences import se3
+from sequences.progress import SILENT, Progress
+from sequences.seeds import generator
+from sequences.types import LocalisationNoise, Run
+
+Array = NDArray[np.float64]
+
+_NOTHING = 1e-9  # of a set's weight: particles that trajectories pass by are left out
+
+
+def backward_run(
+    run: Run, config: Config | None = None, *, context: bool = True, progress: Progress | None = None
+) -> Estimate:
+    """The particle smoother over a run.
+
+    Args:
+        run: from `sequences.bop.load_run`.
+        config: settings; None = the defaults.
+        context: False for objects that know nothing of each other.
+        progress: who is told how far it is.
+
+    Returns:
+        The estimate p(o_t | z_1:T) at every keyframe.
+    """
+    config, told = config or Config(), progress or SILENT
+    state = forward(run, config, context=context, progress=told, keep_past=True)
+    return _estimate(run, state, told)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What trajectories of one class say of the stages of a past."""
+
+    particles: Mapping[int, Particles]
+    """stage -> weighted poses given the whole run; stages at which the class slept have none"""
+    elsewhere: Mapping[int, float]
+    """stage -> share of the trajectories that did not come to it from where they were by the prediction"""
+
+    def at(self, stage: int) -> Particles:
+        """Those of a stage, or of the last one before that has some, or of the first one."""
+        known = sorted(self.particles)
+        before = [j for j in known if j <= stage]
+        return self.particles[before[-1] if before else known[0]]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Where n trajectories of one class are."""
+
+    T_world_centre: Array
+    """(n, 4, 4)"""
+    may_jump: NDArray[np.bool_]
+    """(n,) which may have come there from anywhere nearby"""
+    carried: NDArray[np.bool_]
+    """(n,) which have no past among the particles"""
+
+
+@dataclass(frozen=True)
+class _Link:
+    """How the particles of a stage came from those of one before."""
+
+    spread: Spread | None
+    """None: not at all"""
+    log_elsewhere: float
+    """log density of coming from anywhere nearby, where that is possible"""
+    joins: bool
+    """those before are of another belief: what doesn't come from them by the prediction doesn't come from them"""
+    walked: Array
+    """(6,) standard deviations of the prediction alone, without localisation's error"""
+
+
+class Tracer:
+    """Draws trajectories back through what was kept."""
+
+    def __init__(self, model: Model, localisation: LocalisationNoise) -> None:
+        self.model = model
+        self.localisation = localisation
+
+    def trace(self, object_id: int, stages: Sequence[Stage], c: int, final: Particles | None = None) -> Traced | None:
+        """Trajectories of one class through all stages.
+
+        Args:
+            object_id: for the random numbers.
+            stages: in order of time.
+            c: index of the class.
+            final: the last particles that are kept of it, weighted with all that is known; None = as they are kept.
+
+        Returns:
+            None where no stage has particles of the class.
+        """
+        sets = [(j, stage.classes[c]) for j, stage in enumerate(stages) if c in stage.classes]
+        if not sets:
+            return None
+        j, kept = sets[-1]
+        last = kept.particles() if final is None else final
+        count = self.model.config.filter.trajectories
+        picks = systematic(last.log_weight, count, self._rng(object_id, c, stages[j]).random())
+        line = _Line(last.T_world_centre[picks], kept.may_jump[picks], np.zeros(count, dtype=np.bool_))
+        particles, elsewhere = {j: last}, {}
+        for (h, before), (j, after) in reversed(list(pairwise(sets))):
+            link, rng = self._link(stages[h], stages[j], after, c), self._rng(object_id, c, stages[h])
+            line, particles[h], elsewhere[j] = step_back(line, before, link, self.model.shapes[c], rng)
+        return Traced(particles, elsewhere)
+
+    def _link(self, earlier: Stage, later: Stage, after: Kept, c: int) -> _Link:
+        shape, settings = self.model.shapes[c], self.model.config.prediction
+        dt = (later.time_ns - earlier.time_ns) * 1e-9
+        spread, joins = after.spread, False
+        if spread is None and later.joins:
+            spread, joins = predicted_spread(self.model, self.localisation, dt, later.away_m), True
+        log_elsewhere = float(np.log(settings.jump_probability)) + self.model.log_uniform(shape)
+        walked = np.sqrt(np.diag(self.model.prediction_covariance(max(dt, 1e-3))))
+        return _Link(spread, log_elsewhere, joins, walked)
+
+    def _rng(self, object_id: int, c: int, stage: Stage) -> np.random.Generator:
+        name = f"ffbsi.{self.model.shapes[c].source.obj_id}"
+        return generator(self.model.config.seed, name, object_id, stage.keyframe)
+
+
+def step_back(
+    line: _Line, before: Kept, link: _Link, shape: Shape, rng: np.random.Generator
+) -> tuple[_Line, Particles, float]:
+    """Trajectories one set of particles earlier; what they say of that set; the share that came from elsewhere."""
+    n, earlier = len(line.carried), before.particles()
+    share = np.zeros(len(earlier.log_weight))
+    uniform, normal = rng.random((n, 2)), rng.normal(size=(n, 6))
+    # what has no past is carried by the prediction, which is the same forth and back
+    T = se3.retract(line.T_world_centre, link.walked * normal)
+    may_jump, carried, jumped = np.zeros(n, dtype=np.bool_), line.carried.copy(), np.zeros(n)
+    on = np.flatnonzero(~line.carried)
+    if link.spread is None:
+        carried[:] = True
+    elif len(on):
+        density = transition_log_density(earlier.T_world_centre, line.T_world_centre[on], link.spread, shape)
+        joint = earlier.log_weight + density
+        stayed = logsumexp(joint, axis=1)
+        possible = link.joins | line.may_jump[on]
+        with np.errstate(divide="ignore"):
+            jump = link.log_elsewhere + np.log(possible.astype(np.float64))
+        jumped[on] = np.exp(jump - np.logaddexp(stayed, jump))
+        jumps = uniform[on, 0] < jumped[on]
+        kernel = np.exp(joint - stayed[:, None])
+        share = (1.0 - jumped[on]) @ kernel
+        picks = _pick(kernel, uniform[on, 1])
+        weight = np.exp(earlier.log_weight)
+        if link.joins:
+            carried[on[jumps]] = True
+        else:
+            share += jumped[on].sum() * weight
+            picks[jumps] = _pick(np.broadcast_to(weight, (int(jumps.sum()), len(weight))), uniform[on[jumps], 1])
+        kept = on[~carried[on]]
+        T[kept] = earlier.T_world_centre[picks[~carried[on]]]
+        may_jump[kept] = before.may_jump[picks[~carried[on]]]
+    seen = Particles(
+        np.concatenate([earlier.T_world_centre, T[carried]]), _log(np.append(share, np.ones(int(carried.sum()))))
+    )
+    return _Line(T, may_jump, carried), _compressed(seen), float(jumped.mean())
+
+
+def _pick(weights: Array, uniform: Array) -> NDArray[np.int64]:
+    """One column a row of weights (n, M) of any sum, by numbers (n,) in [0, 1)."""
+    edges = np.cumsum(weights, axis=1)
+    picks = (edges <= uniform[:, None] * edges[:, -1:]).sum(axis=1)
+    return np.minimum(picks, weights.shape[1] - 1)
+
+
+def _log(weights: Array) -> Array:
+    with np.errstate(divide="ignore"):
+        return np.log(weights / weights.sum())
+
+
+def _compressed(particles: Particles) -> Particles:
+    """Without those that weigh nothing."""
+    kept = particles.log_weight > np.log(_NOTHING)
+    return Particles(particles.T_world_centre[kept], mixture.normalised(particles.log_weight[kept]))
+
+
+def leaving(stages: Sequence[Stage], until_ns: int | None, model: Model) -> Array:
+    """log weight (n,) of having been there up to each stage and taken away before the next.
+
+    Args:
+        stages: of one place, in order of time.
+        until_ns: when it is known to be elsewhere; None: the last stage has no next, and is left out (n - 1,).
+        model: potentials.
+    """
+    times = [stage.time_ns for stage in stages] + ([] if until_ns is None else [until_ns])
+    return np.array(
+        [
+            log_sum(stage.log_evidence + _log_leave(model, (later - earlier) * 1e-9))
+            for stage, (earlier, later) in zip(stages, pairwise(times), strict=False)
+        ]
+    )
+
+
+def _log_leave(model: Model, dt_s: float) -> Array:
+    """(C,) log probability of being taken away between two keyframes: Equation 3 in absences, else a push."""
+    settings = model.config.prediction
+    if dt_s < settings.significant_period_s:
+        left = [settings.jump_probability if s.source.movable else 0.0 for s in model.shapes]
+    else:
+        left = [1.0 - model.stay_probability(s.source, dt_s) for s in model.shapes]
+    with np.errstate(divide="ignore"):
+        return np.log(np.array(left))
+
+
+def presence(end: float, stages: Sequence[Stage], left: Array, model: Model) -> tuple[Array, Array]:
+    """P(it was there at each stage | the whole run), and P(it was taken away after each).
+
+    Args:
+        end: P(it is there after the last stage).
+        stages: n of one place.
+        left: from `leaving`, of n or n - 1 stages.
+        model: potentials.
+
+    Returns:
+        (n,) and (n,), the second for the first's stages in order; what is never taken away is still there.
+    """
+    never = stages[-1].log_clutter + np.log1p(-model.config.detector.unfound)
+    share = np.zeros(len(stages))
+    share[: len(left)] = np.exp(mixture.normalised(np.concatenate([left, [never, 0.0]])))[: len(left)]
+    taken = (1.0 - end) * share
+    return end + np.cumsum(taken[::-1])[::-1], taken
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What is said of an object at one place: its stages, and from which keyframe to which it stood there."""
+
+    past: Past
+    first: int
+    """keyframe"""
+    end: int
+    """keyframe after the last"""
+    presence: Array
+    """(n,) at each stage"""
+    taken: Array
+    """(n,) after each stage"""
+    traced: Mapping[int, Traced]
+    """by class"""
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        return self.past.stages
+
+    def stage_at(self, keyframe: int) -> int:
+        """The last one at or before a keyframe, or the first one."""
+        keyframes = [stage.keyframe for stage in self.stages]
+        return max(int(np.searchsorted(keyframes, keyframe, side="right")) - 1, 0)
+
+
+class _Writer:
+    """Puts objects into tables."""
+
+    def __init__(self, run: Run, state: Forward, tables: Tables) -> None:
+        self.model = state.model
+        self.state = state
+        self.tables = tables
+        self.localisation = run.localisation
+        self.frames = [run.frames[int(f)] for f in state.keyframes]
+        self.tracer = Tracer(state.model, run.localisation)
+
+    def write(self, row: int, object_id: int) -> None:
+        """One object at every keyframe from its first on."""
+        final = self.state.reports[-1][object_id]
+        places = self._places(object_id, final)
+        for place in places:
+            for k in range(place.first, place.end):
+                if place is places[-1] and k >= place.stages[-1].keyframe:
+                    # it has seen all that there is to see
+                    visible = final.visible if k == len(self.frames) - 1 else self._in_view(final, k)
+                    replace(final, visible=visible).write(self.tables, row, k, self.model)
+                else:
+                    self._smoothed(place, final, k).write(self.tables, row, k, self.model)
+            self._write_moves(row, place, final)
+
+    def _places(self, object_id: int, final: Reported) -> list[_Place]:
+        """Where it stood, in order of time."""
+        belief = self.state.beliefs[object_id]
+        pasts: list[Past] = []
+        past = belief.past
+        while past is not None:
+            pasts.insert(0, past)
+            past = past.before
+        chosen = [c for c, p in enumerate(final.class_probability) if p > REPORTED or c == final.best_class]
+        out = []
+        for n, past in enumerate(pasts):
+            later = pasts[n + 1] if n + 1 < len(pasts) else None
+            until = None if later is None else max(self.frames[later.begin].time_ns, past.stages[-1].time_ns)
+            there, taken = presence(
+                final.existence if later is None else 0.0,
+                past.stages,
+                leaving(past.stages, until, self.model),
+                self.model,
+            )
+            ends = self._ends(object_id, chosen) if later is None else dict.fromkeys(chosen)
+            traced = {c: self.tracer.trace(object_id, past.stages, c, ends[c]) for c in chosen}
+            out.append(
+                _Place(
+                    past,
+                    first=self._visit_begin(past.begin) if n == 0 else past.begin,
+                    end=len(self.frames) if later is None else later.begin,
+                    presence=there,
+                    taken=taken,
+                    traced={c: t for c, t in traced.items() if t is not None},
+                )
+            )
+        return out
+
+    def _ends(self, object_id: int, chosen: Sequence[int]) -> dict[int, Particles | None]:
+        """The last particles of classes, with the context that they have in the end."""
+        around = self.state.surroundings(self.state.reports[-1]).without(object_id)
+        ends: dict[int, Particles | None] = {}
+        for c in chosen:
+            own = self.state.beliefs[object_id].classes[c]
+            if own is None:
+                ends[c] = None
+                continue
+            nats = around.log_potential(self.model, self.model.shapes[c], own.particles.T_world_centre)
+            weight = mixture.normalised(own.particles.log_weight + nats)
+            ends[c] = Particles(own.particles.T_world_centre, weight)
+        return ends
+
+    def _visit_begin(self, keyframe: int) -> int:
+        visit = self.frames[keyframe].visit
+        return next(k for k, frame in enumerate(self.frames) if frame.visit == visit)
+
+    def _smoothed(self, place: _Place, final: Reported, k: int) -> Reported:
+        """What is said of an object at a keyframe."""
+        j = place.stage_at(k)
+        stage = place.stages[j]
+        shared = np.diag(self.model.shared_variance(self.localisation, stage.away_m))
+        early_s = max((stage.time_ns - self.frames[k].time_ns) * 1e-9, 0.0)
+        if early_s > 0.0:
+            shared = shared + self.model.prediction_covariance(early_s)
+        modes = tuple(
+            (c, log_weight, T, covariance + shared, free)
+            for c, traced in place.traced.items()
+            for _, log_weight, T, covariance, free in modes_of(c, traced.at(j), self.model.shapes[c])
+        )
+        stood = self._stood(final.class_probability, (self.frames[place.past.begin].time_ns - self.frames[k].time_ns))
+        smoothed = replace(final, existence=float(place.presence[j]) * stood, modes=modes, ledger={}, visible=True)
+        return replace(smoothed, visible=self._in_view(smoothed, k))
+
+    def _stood(self, class_probability: Array, before_ns: int) -> float:
+        """P(it stood there already so long before it was first detected)."""
+        if before_ns * 1e-9 < self.model.config.prediction.significant_period_s:
+            return 1.0
+        stay = [self.model.stay_probability(s.source, before_ns * 1e-9) for s in self.model.shapes]
+        return float(class_probability @ np.array(stay))
+
+    def _in_view(self, reported: Reported, k: int) -> bool:
+        T, frame = reported.best_pose, self.frames[k]
+        if T is None:
+            return False
+        return outlook(self.model.shapes[reported.best_class], frame.T_camera_world @ T, frame.camera).share > 0.0
+
+    def _write_moves(self, row: int, place: _Place, final: Reported) -> None:
+        """A line for each gap between views that is long enough to hold a move."""
+        significant_ns = self.model.config.prediction.significant_period_s * 1e9
+        traced = place.traced.get(final.best_class)
+        for j, (a, b) in enumerate(pairwise(place.stages)):
+            if b.keyframe >= place.end or b.time_ns - a.time_ns < significant_ns:
+                continue
+            elsewhere = 0.0 if traced is None else traced.elsewhere.get(j + 1, 0.0)
+            moved = place.taken[j] + place.presence[j + 1] * elsewhere
+            probability = float(np.clip(moved / max(place.presence[j], 1e-12), 0.0, 1.0))
+            self.tables.move(row, (a.keyframe, b.keyframe), probability, (a.time_ns, b.time_ns))
+
+
+def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
+    objects = sorted(state.beliefs)
+    tables = Tables(len(objects), len(state.keyframes), len(state.model.catalogue))
+    writer = _Writer(run, state, tables)
+    with progress.stage("backward simulation", total=len(objects)) as stage:
+        for row, i in enumerate(objects):
+            writer.write(row, i)
+            stage.advance()
+    times = np.array([frame.time_ns for frame in writer.frames])
+    for i, between, same in state.found_moved:
+        if i in state.beliefs:
+            gap = (int(np.searchsorted(times, between[0])), int(np.searchsorted(times, between[1])))
+            tables.move(objects.index(i), gap, same, between)
+    return build_estimate(
+        run,
+        state.model.config,
+        "ffbsi-ct" if state.model.context else "ffbsi-t",
+        state.keyframes,
+        objects,
+        tables,
+        np.stack([frame.T_world_camera for frame in writer.frames]),
+        np.tile(localisation_covariance(run.localisation), (len(writer.frames), 1, 1)),
+        {"diagnostics": {"hypotheses_scored": state.proposer.hypotheses_scored}, **describe(state.place)},
+    )
