@@ -122,8 +122,8 @@ def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape:
 def transition_log_density(T_before: Array, T: Array, spread: Spread, shape: Shape) -> Array:
     """log phi_p(x | x_k) (K, M) of poses (K, 4, 4) given each pose before (M, 4, 4), modulo the object's symmetries."""
     squared, constant = _squared_steps(T_before, T, spread, shape)
-    images = squared.reshape(len(T), -1, len(T_before))
-    return logsumexp(-0.5 * images, axis=1) - constant
+    exponent = -0.5 * squared.reshape(len(T), -1, len(T_before))
+    return (exponent[:, 0] if shape.symmetry.order == 1 else logsumexp(exponent, axis=1)) - constant
 
 
 def _squared_steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Array, float]:

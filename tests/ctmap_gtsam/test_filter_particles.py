@@ -1,6 +1,6 @@
 """Laws of the marginal particle filter: densities are those of the draws, and where all is Gaussian it is Kalman's."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,15 +10,23 @@ from hypothesis import strategies as st
 from ctmap_gtsam.filtering.belief import Updater
 from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
 from ctmap_gtsam.frontend.association import Track
-from ctmap_gtsam.frontend.observation import Observation
-from ctmap_gtsam.frontend.proposer import PoseModes
-from ctmap_gtsam.frontend.scoring import Scores
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from factors import mixture, prediction
 from sequences import se3
 from sequences.types import Detection, LocalisationNoise
-from tests.ctmap_gtsam.scenes import classes, config_of, frame_of, model_of
+from tests.ctmap_gtsam.gaussian import (
+    MISSING,
+    REFERENCE,
+    SCALE,
+    TIMES,
+    GaussianProposer,
+    begun,
+    coordinates,
+    measurements,
+    observation_at,
+)
+from tests.ctmap_gtsam.scenes import classes, config_of, model_of
 from tests.factors.strategies import SYMMETRIES, random_image
 
 MUG = model_of("mug").shapes[0]
@@ -91,89 +99,9 @@ def test_the_heaviest_come_first_and_ties_in_order():
     assert Particles(T, np.full(4, np.log(0.25))).effective == pytest.approx(4.0)
 
 
-@dataclass(frozen=True)
-class Look:
-    """A view that is nothing but its keyframe."""
-
-    detection: Detection | None
-    k: int
-    share: float
-
-    def coarse(self):
-        return self
-
-
-@dataclass
-class GaussianProposer:
-    """A proposer whose images are Gaussians about measured poses; frames without one say nothing."""
-
-    measured: dict[int, np.ndarray]
-    covariance: dict[int, np.ndarray]
-
-    def view(self, observation, box, detection, surroundings=None, share=1.0):
-        return Look(detection, observation.keyframe, share)
-
-    def search(self, shape, view, observation, surroundings, rng, share=1.0):
-        return np.zeros((0, 4, 4))
-
-    def modes(self, shape, view, starts, probe=True):
-        k = view.k
-        there = [k] if k in self.measured else []
-        n = len(there)
-        return PoseModes(
-            np.array([self.measured[i] for i in there]).reshape(n, 4, 4),
-            np.zeros(n),
-            np.zeros(n),
-            np.array([self.covariance[i] for i in there]).reshape(n, 6, 6),
-            np.zeros(n),
-        )
-
-    def witness(self, shape, view, T):
-        return 0.0
-
-    def score(self, shape, view, T):
-        if view.k not in self.measured:
-            return np.zeros(len(T)), in_sight(len(T))
-        r = coordinates(T) - coordinates(self.measured[view.k])
-        return mixture.gaussian_log_density(r, np.linalg.inv(self.covariance[view.k])), in_sight(len(T))
-
-    def near(self, shape, view, T, reach):
-        return float(self.score(shape, view, T[None])[0][0])
-
-    def log_clutter(self, shape, view, T):
-        return 0.0
-
-
-def in_sight(n):
-    return Scores(np.zeros(n), np.ones(n), np.ones(n), np.zeros((n, 4)))
-
-
-def coordinates(T):
-    """Near the reference, poses are vectors: [rotation vector, translation]."""
-    return np.concatenate([se3.so3_log(T[..., :3, :3]), T[..., :3, 3] - REFERENCE[:3, 3]], axis=-1)
-
-
-REFERENCE = se3.make(np.eye(3), np.array([0.0, 0.0, 0.8]))
-TIMES = np.array([0.0, 0.3, 1.0, 1.2, 2.5, 2.6, 4.0])
-MISSING = (2, 5)
-SCALE = np.repeat([0.02, 0.002], 3)
-
-
-def begun(updater, track, observation):
-    """The belief of a new track that nothing surrounds."""
-    nothing = Surroundings((), ())
-    return updater.start(track, observation, nothing, updater.search(track, observation, nothing))
-
-
-def observation_at(k, detection):
-    frame = frame_of(k, np.eye(4), np.zeros((240, 320), np.float32), [detection], time_s=TIMES[k])
-    return Observation(k, frame, frame.read_depth(), ())
-
-
 @pytest.mark.parametrize("share", [0.5, 0.01], ids=["half proposed", "almost all predicted"])
 def test_where_all_is_gaussian_the_filter_is_kalmans(share):
     """Law 7 of the model: means, covariances, evidence; irregular times, missing measurements, random covariances."""
-    rng = np.random.default_rng(5)
     n = 3000
     config = config_of(
         f"filter.particles={n}",
@@ -183,13 +111,7 @@ def test_where_all_is_gaussian_the_filter_is_kalmans(share):
         "prediction.jump_probability=1e-12",
     )
     model = Model(classes("mug"), config, context=False)
-    measured, covariance = {}, {}
-    for k in range(len(TIMES)):
-        if k not in MISSING:
-            A = rng.normal(size=(6, 6)) / np.sqrt(6)
-            covariance[k] = (A @ A.T + 2.0 * np.eye(6)) * SCALE[:, None] * SCALE
-            xi = rng.normal(size=6) * SCALE
-            measured[k] = se3.make(se3.so3_exp(xi[:3]), REFERENCE[:3, 3] + xi[3:])
+    measured, covariance = measurements(np.random.default_rng(5))
     updater = Updater(model, GaussianProposer(measured, covariance), LocalisationNoise())
     detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
     track = Track(0, (0,), (detection,), 0)
