@@ -24,6 +24,7 @@ from ctmap_gtsam.evaluation.record import DETECTOR
 from ctmap_gtsam.evaluation.views import views
 from ctmap_gtsam.export import bop_csv, coco_detections, coco_results
 from ctmap_gtsam.reporting.report import render
+from ctmap_gtsam.runtime.progress import Stopwatch
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.sources import code
 from ctmap_gtsam.runtime.versions import versions
@@ -143,7 +144,12 @@ def summarise(
     """The content of summary.json but for `files`: numbers, or null where there is none."""
     methods: dict[str, Any] = {}
     for name, outcome in outcomes.items():
-        told = {"status": outcome.status, "seconds": outcome.seconds, "reads_truth": outcome.reads_truth}
+        told = {
+            "status": outcome.status,
+            "seconds": outcome.seconds,
+            "stages": dict(outcome.stages),
+            "reads_truth": outcome.reads_truth,
+        }
         if outcome.status == "skipped":
             methods[name] = {**told, "metrics": {}, "reason": outcome.reason, "remedy": outcome.remedy}
         else:
@@ -186,14 +192,14 @@ class _Stored:
             digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
             if about["sha256"] != digest or any(about[name] != value for name, value in self.key.items()):
                 return None
-            return Outcome("ok", about["seconds"], Estimate.load(self.path))
+            return Outcome("ok", about["seconds"], Estimate.load(self.path), stages=about["stages"])
         except (OSError, ValueError, KeyError, TypeError, InputError):
             return None
 
-    def save(self, estimate: Estimate, seconds: float) -> None:
+    def save(self, estimate: Estimate, seconds: float, stages: Mapping[str, float]) -> None:
         estimate.save(self.path)
         digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
-        write_json(self.about, {"seconds": seconds, "sha256": digest, **self.key})
+        write_json(self.about, {"seconds": seconds, "stages": dict(stages), "sha256": digest, **self.key})
 
 
 @dataclass(frozen=True)
@@ -225,13 +231,13 @@ class _Session:
             return found
         assert method.run is not None
         needed = [self.outcome(name) for name in method.needs]
-        start = time.perf_counter()
-        estimate = method.run(self.run, self.config, self.progress, *(one.estimate for one in needed))
+        start, watch = time.perf_counter(), Stopwatch(self.progress)
+        estimate = method.run(self.run, self.config, watch, *(one.estimate for one in needed))
         # what it takes alone
         seconds = time.perf_counter() - start + sum(one.seconds or 0.0 for one in needed)
         if stored is not None:
-            stored.save(estimate, seconds)
-        return Outcome("ok", seconds, estimate)
+            stored.save(estimate, seconds, watch.seconds)
+        return Outcome("ok", seconds, estimate, stages=watch.seconds)
 
     def _stored(self, method: Method) -> _Stored | None:
         """Where its estimate would lie, and all that it is made from."""
@@ -313,4 +319,4 @@ def _outcome(out: Path, name: str, told: Mapping[str, Any]) -> Outcome:
     if told["status"] == "skipped":
         return Outcome("skipped", reason=told["reason"], remedy=told["remedy"], reads_truth=reads_truth)
     estimate = None if name == DETECTOR else Estimate.load(out / ESTIMATES / f"{name}.npz")
-    return Outcome("ok", told["seconds"], estimate, reads_truth=reads_truth)
+    return Outcome("ok", told["seconds"], estimate, reads_truth=reads_truth, stages=told.get("stages", {}))

@@ -12,6 +12,7 @@ The command line hands in `ctmap_gtsam.runtime.progress.RichProgress`, which dra
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
@@ -22,6 +23,9 @@ class Stage(Protocol):
 
     def advance(self, n: int = 1) -> None:
         """Say that n more steps are done."""
+
+    def spent(self, part: str, seconds: float) -> None:
+        """Say that a part of the steps took so long; repeated calls add up. See `timed`."""
 
 
 class Progress(Protocol):
@@ -44,6 +48,22 @@ class _SilentStage:
     def advance(self, n: int = 1) -> None:
         """Show nothing."""
 
+    def spent(self, part: str, seconds: float) -> None:
+        """Keep nothing."""
+
+
+@contextmanager
+def timed(stage: Stage, part: str) -> Iterator[None]:
+    """Tell a stage how long the block takes. Seconds go to whoever listens and never into a result."""
+    began = time.perf_counter()
+    try:
+        yield
+    finally:
+        stage.spent(part, time.perf_counter() - began)
+
+
+SILENT_STAGE: Stage = _SilentStage()
+"""A stage that nobody watches"""
 
 SILENT = SilentProgress()
 """The default of every `progress` parameter"""

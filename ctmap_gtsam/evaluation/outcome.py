@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from ctmap_gtsam.estimate import Estimate
@@ -22,3 +23,5 @@ class Outcome:
     remedy: str = ""
     reads_truth: bool = False
     """whether the method answers from the truth, so that no other is to be held to it"""
+    stages: Mapping[str, float] = field(default_factory=dict)
+    """seconds of each stage and of its parts ("stage: part"), where the method has any"""

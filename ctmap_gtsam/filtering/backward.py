@@ -33,6 +33,7 @@ from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import REPORTED, Reported, predicted_spread
+from ctmap_gtsam.filtering.diagnostics import diagnostics, number
 from ctmap_gtsam.filtering.filter import Forward, forward
 from ctmap_gtsam.filtering.history import Kept, Past, Stage
 from ctmap_gtsam.filtering.particles import Particles, Spread, modes_of, systematic, transition_log_density
@@ -302,6 +303,8 @@ class _Writer:
         self.localisation = run.localisation
         self.frames = [run.frames[int(f)] for f in state.keyframes]
         self.tracer = Tracer(state.model, run.localisation)
+        self.sizes: list[list[float | None]] = [[None] * len(self.frames) for _ in range(tables.objects)]
+        """effective sample size of what trajectories say of each row at each keyframe, for the class it ends with"""
 
     def write(self, row: int, object_id: int) -> None:
         """One object at every keyframe from its first on."""
@@ -316,6 +319,9 @@ class _Writer:
                 else:
                     self._smoothed(place, final, k).write(self.tables, row, k, self.model)
             self._write_moves(row, place, final)
+            traced = place.traced.get(final.best_class)
+            for j, particles in ({} if traced is None else traced.particles).items():
+                self.sizes[row][place.stages[j].keyframe] = number(particles.effective)
 
     def _places(self, object_id: int, final: Reported) -> list[_Place]:
         """Where it stood, in order of time."""
@@ -424,6 +430,8 @@ def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
         if i in state.beliefs:
             gap = (int(np.searchsorted(times, between[0])), int(np.searchsorted(times, between[1])))
             tables.move(objects.index(i), gap, same, between)
+    told = diagnostics(objects, state.reports, state.scored)
+    told["objects"]["smoothed_sample_size"] = writer.sizes
     return build_estimate(
         run,
         state.model.config,
@@ -433,5 +441,5 @@ def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
         tables,
         np.stack([frame.T_world_camera for frame in writer.frames]),
         np.tile(localisation_covariance(run.localisation), (len(writer.frames), 1, 1)),
-        {"diagnostics": {"hypotheses_scored": state.proposer.hypotheses_scored}, **describe(state.place)},
+        {"diagnostics": told, **describe(state.place)},
     )

@@ -135,6 +135,8 @@ class Reported:
     modes: tuple[tuple[int, float, Array, Array, Array], ...]
     """class index, log weight, T_world_centre (4, 4), covariance (6, 6), free axes (6, f)"""
     ledger: dict[str, float]
+    effective: float = 0.0
+    """effective sample size of the most probable class"""
 
     @property
     def best_class(self) -> int:
@@ -317,7 +319,8 @@ class Updater:
             "context": float(context[best]) if np.isfinite(context[best]) else 0.0,
         }
         elsewhere = float(np.exp(belief.log_elsewhere - np.logaddexp(there, belief.log_elsewhere)))
-        return Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), ledger)
+        effective = 0.0 if chosen is None else chosen.particles.effective
+        return Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), ledger, effective)
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""

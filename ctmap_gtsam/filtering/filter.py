@@ -7,7 +7,8 @@ the weights account for; the context multiplies the reported posterior once, not
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,6 +19,7 @@ from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
+from ctmap_gtsam.filtering.diagnostics import Scored, diagnostics
 from ctmap_gtsam.filtering.history import one_past
 from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
 from ctmap_gtsam.frontend.association import Associator, Track
@@ -27,7 +29,7 @@ from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
-from sequences.progress import SILENT, Progress
+from sequences.progress import SILENT, SILENT_STAGE, Progress, Stage, timed
 from sequences.types import Detection, Frame, Run
 
 Array = NDArray[np.float64]
@@ -61,8 +63,11 @@ def forward(
     keyframes = select_keyframes(run, config.keyframes)
     state = Forward(run, model, keyframes, keep_past=keep_past)
     with progress.stage("filter-ct" if context else "filter-t", total=len(keyframes)) as stage:
-        for observation in observations(run, keyframes, config.seed):
-            state.step(observation)
+        images = observations(run, keyframes, config.seed)
+        for _ in keyframes:
+            with timed(stage, "images"):
+                observation = next(images)
+            state.step(observation, stage)
             stage.advance()
     return state
 
@@ -85,25 +90,44 @@ class Forward:
         self.reports: list[dict[int, Reported]] = []
         self.found_moved: list[tuple[int, tuple[int, int], float]] = []
         """object, times of its last detection at the old place and its first at the new one, P(it is the same)"""
+        self.scored = Scored()
 
-    def step(self, observation: Observation) -> None:
-        """Algorithm 1 for every object. Neighbours are those of the keyframe before, so objects have no order."""
-        self.associator.step(observation)
-        self.place.update(observation)
+    def step(self, observation: Observation, stage: Stage = SILENT_STAGE) -> None:
+        """Algorithm 1 for every object. Neighbours are those of the keyframe before, so objects have no order.
+
+        Args:
+            observation: of the next keyframe.
+            stage: is told what parts take how long.
+        """
+        self.scored.begin()
+        with timed(stage, "tracks and surfaces"):
+            self.associator.step(observation)
+            self.place.update(observation)
         before = self.reports[-1] if self.reports else {}
         surroundings = self.surroundings(before)
         tracks = self.associator.tracks()
         reported: dict[int, Reported] = {}
         for i, detection in self._detections(tracks, observation).items():
             around = surroundings.without(i)
-            belief = self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
+            with self._counted(i, stage, "objects"):
+                belief = self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
             # what nobody sees is believed to be as it was
             unseen = not belief.visible and i in before
-            reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
-        reported = self._start([t for t in tracks if t.track_id not in self.owner], observation, reported, before)
+            with timed(stage, "reports"):
+                reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
+        new = [t for t in tracks if t.track_id not in self.owner]
+        reported = self._start(new, observation, reported, before, stage)
         for i, r in reported.items():
             self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
         self.reports.append(self._find_moved(self._merge(reported)))
+
+    @contextmanager
+    def _counted(self, i: int, stage: Stage, part: str) -> Iterator[None]:
+        """A block that works on one object: its hypotheses and seconds are told."""
+        before = self.proposer.hypotheses_scored
+        with timed(stage, part):
+            yield
+        self.scored.add(i, self.proposer.hypotheses_scored - before)
 
     def _detections(self, tracks: tuple[Track, ...], observation: Observation) -> dict[int, Detection | None]:
         """Every object's detection, the surest where several of its tracks have one.
@@ -129,6 +153,7 @@ class Forward:
         observation: Observation,
         reported: Mapping[int, Reported],
         before: Mapping[int, Reported],
+        stage: Stage,
     ) -> dict[int, Reported]:
         """`reported` with the objects of tracks that have just become consistent, where they aren't known already.
 
@@ -138,12 +163,16 @@ class Forward:
         started: dict[int, Belief] = {}
         fresh: dict[int, Reported] = {}
         alone = self.surroundings(before)
-        found = {track.track_id: self.updater.search(track, observation, alone) for track in new}
+        found = {}
+        for track in new:
+            with self._counted(track.track_id, stage, "new objects"):
+                found[track.track_id] = self.updater.search(track, observation, alone)
         for _ in range(2 if len(new) > 1 else 1):
             surroundings = self.surroundings({**before, **fresh})
             for track in new:
                 i = track.track_id
-                started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
+                with self._counted(i, stage, "new objects"):
+                    started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
             fresh = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
         there = dict(reported)
         for i, report in fresh.items():
@@ -218,7 +247,7 @@ def _estimate(run: Run, state: Forward) -> Estimate:
         np.stack([frame.T_world_camera for frame in frames]),
         np.tile(localisation_covariance(run.localisation), (len(frames), 1, 1)),
         {
-            "diagnostics": {"hypotheses_scored": state.proposer.hypotheses_scored},
+            "diagnostics": diagnostics(objects, state.reports, state.scored),
             **describe(state.place),
         },
     )

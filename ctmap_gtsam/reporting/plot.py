@@ -18,11 +18,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
+from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation.comparison import Comparison
 from ctmap_gtsam.reporting.colours import FILTER, QUIET, SMOOTHER
 from ctmap_gtsam.reporting.maps import jpeg, overlay
 
-__all__ = ["belief_over_time", "error_over_time", "jpeg", "overlay", "svg"]
+__all__ = ["belief_over_time", "error_over_time", "filter_over_time", "jpeg", "overlay", "svg"]
 
 Array = NDArray[np.float64]
 
@@ -102,6 +103,43 @@ def belief_over_time(comparison: Comparison, methods: Sequence[str], objects: Se
             _line(ax, comparison, values, method, methods)
         ax.set_ylim(-0.04, 1.04)
         ax.set_ylabel("P(exists) P(class)")
+    return figure
+
+
+FILTERED = (
+    ("effective_sample_size", "particles that count"),
+    ("class_entropy", "class entropy, nats"),
+    ("hypotheses_scored", "hypotheses scored"),
+)
+"""What `filter_over_time` draws of `Estimate.meta["diagnostics"]["objects"]`, and what its axes say"""
+
+
+def filter_over_time(estimate: Estimate) -> Figure | None:
+    """How a particle filter did at each keyframe: one panel each, one line an object; None where it says nothing of it.
+
+    Args:
+        estimate: of a method that keeps these diagnostics (docs/format.md).
+    """
+    told = estimate.meta.get("diagnostics", {}).get("objects", {})
+    if not len(estimate.object_id) or any(name not in told for name, _ in FILTERED):
+        return None
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10.4, 2.4), layout=ConstrainedLayoutEngine(wspace=0.03))
+        for column, (name, label) in enumerate(FILTERED):
+            ax = figure.add_subplot(1, len(FILTERED), column + 1)
+            for row, values in enumerate(told[name]):
+                known = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+                if name == "hypotheses_scored":
+                    known[known == 0.0] = np.nan
+                colour = _LINES[row % len(_LINES)]
+                ax.plot(known, color=colour, linewidth=1.1, marker="." if len(known) <= 40 else "", markersize=4)
+            ax.set_yscale("symlog", linthresh=0.01) if name == "class_entropy" else ax.set_yscale("log")
+            ax.yaxis.set_minor_locator(NullLocator())
+            ax.set_title(label, loc="left", fontsize=10.5, fontweight="bold")
+            ax.set_xlabel("keyframe; dashed: a new visit")
+            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+            for k in np.flatnonzero(np.diff(estimate.keyframe_visit)):
+                ax.axvline(k + 0.5, color=QUIET, linestyle=(0, (4, 3)), linewidth=1)
     return figure
 
 

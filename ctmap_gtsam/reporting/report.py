@@ -83,6 +83,8 @@ def render(
         agreement_columns=tables.AGREEMENT_COLUMNS,
         agreement_rows=tables.agreement_rows(comparison),
         reference=comparison.reference,
+        filtered=_filtered(outcomes, shown),
+        stages=tables.stage_rows(outcomes),
         notes=notes(run, outcomes),
         versions=versions,
     )
@@ -192,6 +194,16 @@ def _legend(run: Run, outcomes: Mapping[str, Outcome], shown: Sequence[str]) -> 
         held |= {int(c) for c in np.unique(estimate.best_class[estimate.exists])}
     colours = class_colours(run.catalogue)
     return [(run.catalogue[c].name.replace("_", " "), css(colours[c])) for c in sorted(held)]
+
+
+def _filtered(outcomes: Mapping[str, Outcome], shown: Sequence[str]) -> tuple[str, Markup] | None:
+    """The first shown method that says how its particles did, and the plot of that."""
+    for name in shown:
+        estimate = outcomes[name].estimate
+        figure = None if estimate is None else plot.filter_over_time(estimate)
+        if figure is not None:
+            return name, _figure(figure)
+    return None
 
 
 def _drawable(comparison: Comparison, shown: Sequence[str]) -> bool:

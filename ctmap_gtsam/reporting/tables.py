@@ -119,6 +119,21 @@ def more_rows(comparison: Comparison, outcomes: Mapping[str, Outcome], columns: 
     ]
 
 
+def stage_rows(outcomes: Mapping[str, Outcome]) -> list[tuple[str, str]]:
+    """What each method says that its stages took, and the parts of each: method, words."""
+    rows = []
+    for name, outcome in outcomes.items():
+        whole = {stage: seconds for stage, seconds in outcome.stages.items() if ": " not in stage}
+        said = []
+        for stage, seconds in whole.items():
+            parts = {s.removeprefix(f"{stage}: "): t for s, t in outcome.stages.items() if s.startswith(f"{stage}: ")}
+            inner = f" ({', '.join(f'{part} {t:.1f}' for part, t in parts.items())})" if parts else ""
+            said.append(f"{stage} {seconds:.1f}{inner}")
+        if said:
+            rows.append((name, ", ".join(said)))
+    return rows
+
+
 def _method_cells(
     comparison: Comparison, outcomes: Mapping[str, Outcome], name: str, columns: Sequence[Column]
 ) -> list[Cell]:

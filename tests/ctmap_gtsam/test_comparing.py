@@ -18,6 +18,7 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.runtime.sources import code
 from sequences.bop import load_run, load_truth
 from sequences.errors import InputError
+from sequences.progress import timed
 from tests.ctmap_gtsam import synthetic
 
 
@@ -41,6 +42,8 @@ class Fake:
         assert [estimate.meta["method"] for estimate in needed] == list(self.needs)
         if self.ran is not None:
             self.ran.append(self.name)
+        with progress.stage("work") as stage, timed(stage, "half of it"):
+            pass
         meta = {"method": self.name, "seed": config.seed}
         return synthetic.estimate_of(run, load_truth(run), disturb=synthetic.shifted(self.metres), meta=meta)
 
@@ -93,6 +96,8 @@ def test_the_folder_holds_everything(path, tmp_path, registry):
     assert "Open3D" in methods["icp"]["reason"]
     assert methods["filter-ct"]["status"] == "ok"
     assert methods["filter-ct"]["seconds"] > 0
+    assert list(methods["filter-ct"]["stages"]) == ["work: half of it", "work"]
+    assert methods["detector"]["stages"] == {}
     assert methods["filter-ct"]["metrics"]["mssd_mm_median"] == pytest.approx(3.0, abs=1e-6)
     assert methods["filter-ct"]["metrics"]["objects"]["clay_brick"]["mssd_mm_median"] == pytest.approx(3.0, abs=1e-6)
     assert methods["detector"]["metrics"]["mssd_mm_median"] is None

@@ -74,6 +74,26 @@ def test_no_pose_is_surer_than_the_camera_that_saw_it(scene):
     assert (estimate.modes.covariance[:, range(6), range(6)] > least).all()
 
 
+def test_it_says_how_it_did_at_each_keyframe(estimate):
+    told = estimate.meta["diagnostics"]
+    n, k = estimate.existence.shape
+    started = CONFIG.frontend.start_after - 1
+    assert told["hypotheses_scored"] == sum(told["keyframes"]["hypotheses_scored"])
+    by_object = np.array(told["objects"]["hypotheses_scored"])
+    assert by_object.shape == (n, k)
+    np.testing.assert_array_equal(by_object.sum(axis=0), told["keyframes"]["hypotheses_scored"])
+    assert (by_object[:, :started] == 0).all()
+    effective = np.array(told["objects"]["effective_sample_size"], dtype=float)
+    entropy = np.array(told["objects"]["class_entropy"], dtype=float)
+    for table in (effective, entropy):
+        np.testing.assert_array_equal(np.isnan(table), ~estimate.in_view)
+    seen = estimate.in_view
+    assert (effective[seen] >= 1.0).all()
+    assert (effective[seen] <= CONFIG.filter.particles).all()
+    p = np.maximum(estimate.class_probability, 1e-300)
+    np.testing.assert_allclose(entropy[seen], -(p * np.log(p)).sum(-1)[seen], rtol=1e-3, atol=1e-6)
+
+
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(scene, tmp_path):
     assert_the_seed_decides(lambda seed: filter_run(scene[0], replace(CONFIG, seed=seed)), tmp_path)
 

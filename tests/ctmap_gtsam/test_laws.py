@@ -41,6 +41,7 @@ BLIND = tuple(name for name, method in METHODS.items() if method.run is not None
 TRUTH = ("scene_gt*.json", "scene_camera_gt.json", "mask", "mask_visib")
 
 each_estimator = pytest.mark.parametrize("method", BOTH)
+each_of_three = pytest.mark.parametrize("method", [*BOTH, "ffbsi-ct"])
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +124,7 @@ def arrays_of(estimate: Estimate, folder: Path) -> dict[str, np.ndarray]:
         return {name: archive[name] for name in archive.files if name != "meta"}
 
 
-@each_estimator
+@each_of_three
 def test_the_order_in_which_files_list_things_changes_nothing(simulated, method, tmp_path):
     """Law 3 of the model."""
     shuffled = copy_of(simulated, tmp_path)
@@ -156,7 +157,7 @@ def test_the_number_of_threads_changes_nothing(scene, method, tmp_path):
     assert answers[0] == answers[1]
 
 
-@each_estimator
+@each_of_three
 def test_moving_the_whole_world_moves_the_whole_answer(scene, method):
     """Law 4 of the model."""
     G = se3.exp(np.array([0.4, -0.3, 1.0, 2.0, -1.0, 0.5]))

@@ -3,8 +3,8 @@ import io
 import pytest
 from rich.console import Console
 
-from ctmap_gtsam.runtime.progress import RichProgress
-from sequences.progress import SILENT, Progress
+from ctmap_gtsam.runtime.progress import RichProgress, Stopwatch
+from sequences.progress import SILENT, Progress, timed
 
 
 def log_of(console: Console) -> list[str]:
@@ -55,3 +55,28 @@ def test_a_terminal_shows_how_far_each_stage_is() -> None:
         progress._bars.refresh()
     assert isinstance(console.file, io.StringIO)
     assert "4/7" in console.file.getvalue()
+
+
+def test_a_stopwatch_keeps_stages_and_their_parts_and_hands_all_on() -> None:
+    console = plain()
+    with RichProgress(console) as progress:
+        watch = Stopwatch(progress)
+        for _ in range(2):
+            with watch.stage("filter") as stage:
+                stage.spent("images", 2.0)
+                stage.spent("objects", 1.5)
+                stage.advance()
+        work(watch)
+    assert watch.seconds["filter: images"] == 4.0
+    assert watch.seconds["filter: objects"] == 3.0
+    assert watch.seconds.keys() == {"filter: images", "filter: objects", "filter", "[inner]", "outer"}
+    assert watch.seconds["outer"] >= watch.seconds["[inner]"] >= 0.0
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("(images 2.0, objects 1.5)") == 2
+
+
+def test_what_fails_has_taken_its_time_too() -> None:
+    watch = Stopwatch(SILENT)
+    with watch.stage("outer") as stage, pytest.raises(ValueError, match="bad"), timed(stage, "part"):
+        raise ValueError("bad")
+    assert watch.seconds["outer"] >= watch.seconds["outer: part"] >= 0.0

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import cv2
@@ -20,6 +21,20 @@ from tests.ctmap_gtsam import synthetic
 VOID = {"meta", "img", "br", "link", "hr", "input", "path", "use", "rect"}
 
 
+def with_diagnostics(estimate):
+    """As the particle filter says how it did; the first keyframe has no belief yet."""
+    shape = estimate.existence.shape
+    tables = {
+        "effective_sample_size": np.full(shape, 40.0).tolist(),
+        "class_entropy": np.full(shape, 0.1).tolist(),
+        "hypotheses_scored": np.full(shape, 900).tolist(),
+    }
+    for name in ("effective_sample_size", "class_entropy"):
+        for row in tables[name]:
+            row[0] = None
+    return replace(estimate, meta={**estimate.meta, "diagnostics": {"hypotheses_scored": 900, "objects": tables}})
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     run = load_run(synthetic.write_run(tmp_path_factory.mktemp("run") / "small", visits=2))
@@ -32,10 +47,11 @@ def outcomes(small):
     wrong = synthetic.estimate_of(
         run, truth, disturb=synthetic.shifted(0.004), class_of=lambda n, f: 9 if n == 0 and f < 5 else None
     )
+    stages = {"filter-ct: images": 1.0, "filter-ct: objects": 2.0, "filter-ct": 3.2}
     return {
         "detector": Outcome("ok", 0.0),
         "icp": Outcome("skipped", reason="Open3D can't be loaded.", remedy="Install libgl1 & <libgomp1>."),
-        "filter-ct": Outcome("ok", 3.25, wrong),
+        "filter-ct": Outcome("ok", 3.25, with_diagnostics(wrong), stages=stages),
         "smooth-ct": Outcome("ok", 12.5, synthetic.estimate_of(run, truth)),
     }
 
@@ -232,6 +248,20 @@ def test_figures_draw_the_objects_asked_for(small, outcomes):
         assert len(draw(comparison, ["smooth-ct"]).axes) == len(comparison.labels) > 1
         (panel,) = draw(comparison, ["smooth-ct"], objects=one).axes
         assert panel.get_title(loc="left") == one[0].replace("_", " ")
+
+
+def test_how_the_filter_did_is_drawn_where_it_says_so(small, outcomes, page):
+    figure = plot.filter_over_time(outcomes["filter-ct"].estimate)
+    assert [len(ax.lines) for ax in figure.axes] == [3 + 1] * 3  # an object each, and where the second visit begins
+    assert plot.filter_over_time(outcomes["smooth-ct"].estimate) is None
+    assert "How the filter did" in page
+    without = {name: o for name, o in outcomes.items() if name != "filter-ct"}
+    assert "How the filter did" not in page_of(small[0], without)
+
+
+def test_the_time_is_told_by_stage_and_part(outcomes, page):
+    assert tables.stage_rows(outcomes) == [("filter-ct", "filter-ct 3.2 (images 1.0, objects 2.0)")]
+    assert "images 1.0, objects 2.0" in page
 
 
 def test_figures_are_the_same_bytes_twice(small, outcomes):
