@@ -8,11 +8,12 @@ where a trajectory is at one keyframe, it was at particle j of the keyframe befo
 with the transition p that the forward pass weighed with: the prediction in view, and a small part that comes from
 anywhere nearby. What is reported of a keyframe are the means of these probabilities over all trajectories (the draws
 but for the last, Rao-Blackwellised), a weighted particle set as the filter's. The class is not drawn: it has its own
-particles, and its posterior is that of the last keyframe, which has seen the whole run. No image is looked at again.
+particles and trajectories. No image is looked at again.
 
-Beside that, whether the thing was there at all: either it still is at the end, as the filter says then, or it was taken
-away after one of the keyframes (Equation 3 in absences, the chance of a push in view) or never was there; each with the
-evidence that the filter had collected by then, since what comes later says nothing for one that has gone.
+Whether the thing was there, and of what class, is weighed beside that, exactly: either it is still there in the end, as
+the filter says then, or it was taken away after one of the keyframes (Equation 3 in absences, the chance of a push in
+view), or never was there; each with the evidence that the filter had collected by then, since what comes later says
+nothing of one that has gone. A trajectory begins where its thing was last there.
 
 What has no past among the particles is carried back by the prediction alone: a pose that a search found late and that
 explained the views kept before better, and an object before its track was consistent. It is carried to its first box,
@@ -42,7 +43,6 @@ from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import mixture
-from factors.mixture import log_sum
 from sequences import se3
 from sequences.progress import SILENT, Progress
 from sequences.seeds import generator
@@ -99,6 +99,14 @@ class _Line:
     carried: NDArray[np.bool_]
     """(n,) which have no past among the particles"""
 
+    def joined(self, particles: Particles, kept: Kept, picks: NDArray[np.int64]) -> _Line:
+        """With some that begin at a set of particles."""
+        return _Line(
+            np.concatenate([self.T_world_centre, particles.T_world_centre[picks]]),
+            np.append(self.may_jump, kept.may_jump[picks]),
+            np.append(self.carried, np.zeros(len(picks), dtype=np.bool_)),
+        )
+
 
 @dataclass(frozen=True)
 class _Link:
@@ -121,31 +129,50 @@ class Tracer:
         self.model = model
         self.localisation = localisation
 
-    def trace(self, object_id: int, stages: Sequence[Stage], c: int, final: Particles | None = None) -> Traced | None:
+    def trace(
+        self, object_id: int, stages: Sequence[Stage], c: int, last: Array, final: Particles | None = None
+    ) -> Traced | None:
         """Trajectories of one class through all stages.
 
         Args:
             object_id: for the random numbers.
-            stages: in order of time.
+            stages: n in order of time.
             c: index of the class.
+            last: (n,) weight of having been there for the last time at each.
             final: the last particles that are kept of it, weighted with all that is known; None = as they are kept.
 
         Returns:
-            None where no stage has particles of the class.
+            None where no stage at which it may have been has particles of the class.
         """
         sets = [(j, stage.classes[c]) for j, stage in enumerate(stages) if c in stage.classes]
-        if not sets:
-            return None
-        j, kept = sets[-1]
-        last = kept.particles() if final is None else final
-        count = self.model.config.filter.trajectories
-        picks = systematic(last.log_weight, count, self._rng(object_id, c, stages[j]).random())
-        line = _Line(last.T_world_centre[picks], kept.may_jump[picks], np.zeros(count, dtype=np.bool_))
-        particles, elsewhere = {j: last}, {}
-        for (h, before), (j, after) in reversed(list(pairwise(sets))):
-            link, rng = self._link(stages[h], stages[j], after, c), self._rng(object_id, c, stages[h])
-            line, particles[h], elsewhere[j] = step_back(line, before, link, self.model.shapes[c], rng)
-        return Traced(particles, elsewhere)
+        begin = self._beginning([j for j, _ in sets], last, self._rng(object_id, c, stages[-1]).random())
+        particles: dict[int, Particles] = {}
+        elsewhere: dict[int, float] = {}
+        line = _Line(np.zeros((0, 4, 4)), np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.bool_))
+        for m, (j, kept) in reversed(list(enumerate(sets))):
+            rng, seen = self._rng(object_id, c, stages[j]), []
+            if len(line.carried):
+                later, after = sets[m + 1]
+                link = self._link(stages[j], stages[later], after, c)
+                line, smoothed, elsewhere[later] = step_back(line, kept, link, self.model.shapes[c], rng)
+                seen.append((smoothed, len(line.carried)))
+            if begin[m]:
+                own = kept.particles() if final is None or m + 1 < len(sets) else final
+                seen.append((own, int(begin[m])))
+                line = line.joined(own, kept, systematic(own.log_weight, int(begin[m]), rng.random()))
+            if seen:
+                particles[j] = _mixed(seen)
+        return Traced(particles, elsewhere) if particles else None
+
+    def _beginning(self, sets: Sequence[int], last: Array, uniform: float) -> NDArray[np.int64]:
+        """How many trajectories begin at each set of particles, which are held until the next one."""
+        weight = np.zeros(len(sets))
+        held = np.searchsorted(sets, np.arange(len(last)), side="right") - 1
+        np.add.at(weight, held[held >= 0], last[held >= 0])
+        if weight.sum() <= 0.0:
+            return np.zeros(len(sets), dtype=np.int64)
+        picks = systematic(_log(weight), self.model.config.filter.trajectories, uniform)
+        return np.bincount(picks, minlength=len(sets))
 
     def _link(self, earlier: Stage, later: Stage, after: Kept, c: int) -> _Link:
         shape, settings = self.model.shapes[c], self.model.config.prediction
@@ -220,21 +247,28 @@ def _compressed(particles: Particles) -> Particles:
     return Particles(particles.T_world_centre[kept], mixture.normalised(particles.log_weight[kept]))
 
 
+def _mixed(sets: Sequence[tuple[Particles, int]]) -> Particles:
+    """Several sets as one, each with the weight of its trajectories."""
+    if len(sets) == 1:
+        return sets[0][0]
+    weights = [particles.log_weight + np.log(count) for particles, count in sets]
+    T = np.concatenate([particles.T_world_centre for particles, _ in sets])
+    return _compressed(Particles(T, mixture.normalised(np.concatenate(weights))))
+
+
 def leaving(stages: Sequence[Stage], until_ns: int | None, model: Model) -> Array:
-    """log weight (n,) of having been there up to each stage and taken away before the next.
+    """log weight (n, C) of having been there, as each class, up to each stage and taken away before the next.
 
     Args:
-        stages: of one place, in order of time.
-        until_ns: when it is known to be elsewhere; None: the last stage has no next, and is left out (n - 1,).
+        stages: n of one place, in order of time.
+        until_ns: when it is known to be elsewhere; None: the last stage has no next, and nothing left after it.
         model: potentials.
     """
     times = [stage.time_ns for stage in stages] + ([] if until_ns is None else [until_ns])
-    return np.array(
-        [
-            log_sum(stage.log_evidence + _log_leave(model, (later - earlier) * 1e-9))
-            for stage, (earlier, later) in zip(stages, pairwise(times), strict=False)
-        ]
-    )
+    out = np.full((len(stages), len(model.shapes)), -np.inf)
+    for j, (earlier, later) in enumerate(pairwise(times)):
+        out[j] = stages[j].log_evidence + _log_leave(model, (later - earlier) * 1e-9)
+    return out
 
 
 def _log_leave(model: Model, dt_s: float) -> Array:
@@ -248,23 +282,22 @@ def _log_leave(model: Model, dt_s: float) -> Array:
         return np.log(np.array(left))
 
 
-def presence(end: float, stages: Sequence[Stage], left: Array, model: Model) -> tuple[Array, Array]:
-    """P(it was there at each stage | the whole run), and P(it was taken away after each).
+def last_there(end: Array, left: Array, log_clutter: float, model: Model) -> Array:
+    """P(it was there as class c, for the last time at stage j | the whole run) (n, C).
+
+    What is left to one is that it never was there, or is clutter.
 
     Args:
-        end: P(it is there after the last stage).
-        stages: n of one place.
-        left: from `leaving`, of n or n - 1 stages.
+        end: (C,) P(it is there after the last stage, as class c).
+        left: (n, C) from `leaving`.
+        log_clutter: log evidence of something that no mesh explains, of all stages.
         model: potentials.
-
-    Returns:
-        (n,) and (n,), the second for the first's stages in order; what is never taken away is still there.
     """
-    never = stages[-1].log_clutter + np.log1p(-model.config.detector.unfound)
-    share = np.zeros(len(stages))
-    share[: len(left)] = np.exp(mixture.normalised(np.concatenate([left, [never, 0.0]])))[: len(left)]
-    taken = (1.0 - end) * share
-    return end + np.cumsum(taken[::-1])[::-1], taken
+    never = log_clutter + np.log1p(-model.config.detector.unfound)
+    share = np.exp(mixture.normalised(np.concatenate([left.ravel(), [never, 0.0]])))[: left.size]
+    last = (1.0 - end.sum()) * share.reshape(left.shape)
+    last[-1] += end
+    return last
 
 
 @dataclass(frozen=True)
@@ -276,10 +309,12 @@ class _Place:
     """keyframe"""
     end: int
     """keyframe after the last"""
+    last: Array
+    """(n, C) P(it was there as class c, for the last time at stage j)"""
     presence: Array
-    """(n,) at each stage"""
-    taken: Array
-    """(n,) after each stage"""
+    """(n,) P(it was there at each stage)"""
+    class_probability: Array
+    """(n, C) given that it was there"""
     traced: Mapping[int, Traced]
     """by class"""
 
@@ -318,10 +353,11 @@ class _Writer:
                     replace(final, visible=visible).write(self.tables, row, k, self.model)
                 else:
                     self._smoothed(place, final, k).write(self.tables, row, k, self.model)
-            self._write_moves(row, place, final)
-            traced = place.traced.get(final.best_class)
-            for j, particles in ({} if traced is None else traced.particles).items():
-                self.sizes[row][place.stages[j].keyframe] = number(particles.effective)
+            self._write_moves(row, place)
+            for j, stage in enumerate(place.stages):
+                traced = place.traced.get(int(np.argmax(place.class_probability[j])))
+                if traced is not None and j in traced.particles:
+                    self.sizes[row][stage.keyframe] = number(traced.particles[j].effective)
 
     def _places(self, object_id: int, final: Reported) -> list[_Place]:
         """Where it stood, in order of time."""
@@ -331,30 +367,42 @@ class _Writer:
         while past is not None:
             pasts.insert(0, past)
             past = past.before
-        chosen = [c for c, p in enumerate(final.class_probability) if p > REPORTED or c == final.best_class]
-        out = []
-        for n, past in enumerate(pasts):
-            later = pasts[n + 1] if n + 1 < len(pasts) else None
-            until = None if later is None else max(self.frames[later.begin].time_ns, past.stages[-1].time_ns)
-            there, taken = presence(
-                final.existence if later is None else 0.0,
-                past.stages,
-                leaving(past.stages, until, self.model),
-                self.model,
-            )
-            ends = self._ends(object_id, chosen) if later is None else dict.fromkeys(chosen)
-            traced = {c: self.tracer.trace(object_id, past.stages, c, ends[c]) for c in chosen}
-            out.append(
-                _Place(
-                    past,
-                    first=self._visit_begin(past.begin) if n == 0 else past.begin,
-                    end=len(self.frames) if later is None else later.begin,
-                    presence=there,
-                    taken=taken,
-                    traced={c: t for c, t in traced.items() if t is not None},
-                )
-            )
-        return out
+        places: list[_Place] = []
+        for past, later in zip(reversed(pasts), [None, *reversed(pasts)], strict=False):
+            places.insert(0, self._place(object_id, past, later, final, places[0] if places else None))
+        return places
+
+    def _place(
+        self, object_id: int, past: Past, later: Past | None, final: Reported, following: _Place | None
+    ) -> _Place:
+        """What is said of one place, given what is said of the one after it."""
+        until = None if later is None else max(self.frames[later.begin].time_ns, past.stages[-1].time_ns)
+        end = final.existence * final.class_probability * (later is None)
+        last = last_there(end, leaving(past.stages, until, self.model), past.stages[-1].log_clutter, self.model)
+        joint = np.cumsum(last[::-1], axis=0)[::-1]
+        there = joint.sum(axis=1)
+        probability = joint / np.maximum(there, 1e-300)[:, None]
+        probability[there <= 0.0] = final.class_probability
+        if following is not None:  # one thing has one class, which the place after knows best
+            probability = np.tile(following.class_probability[0], (len(there), 1))
+        best = np.argmax(probability, axis=1)
+        chosen = sorted({*np.flatnonzero((probability > REPORTED).any(axis=0)).tolist(), *best.tolist()})
+        ends = self._ends(object_id, chosen) if later is None else dict.fromkeys(chosen)
+        traced = {}
+        for c in chosen:
+            own = last[:, c] if last[:, c].sum() > 0.0 else last.sum(axis=1)
+            one = self.tracer.trace(object_id, past.stages, c, own, ends[c])
+            if one is not None:
+                traced[c] = one
+        return _Place(
+            past,
+            first=self._visit_begin(past.begin) if past.before is None else past.begin,
+            end=len(self.frames) if later is None else later.begin,
+            last=last,
+            presence=there,
+            class_probability=probability,
+            traced=traced,
+        )
 
     def _ends(self, object_id: int, chosen: Sequence[int]) -> dict[int, Particles | None]:
         """The last particles of classes, with the context that they have in the end."""
@@ -382,13 +430,19 @@ class _Writer:
         early_s = max((stage.time_ns - self.frames[k].time_ns) * 1e-9, 0.0)
         if early_s > 0.0:
             shared = shared + self.model.prediction_covariance(early_s)
+        probability = place.class_probability[j]
+        best = int(np.argmax(probability))
         modes = tuple(
             (c, log_weight, T, covariance + shared, free)
             for c, traced in place.traced.items()
+            if probability[c] > REPORTED or c == best
             for _, log_weight, T, covariance, free in modes_of(c, traced.at(j), self.model.shapes[c])
         )
-        stood = self._stood(final.class_probability, (self.frames[place.past.begin].time_ns - self.frames[k].time_ns))
-        smoothed = replace(final, existence=float(place.presence[j]) * stood, modes=modes, ledger={}, visible=True)
+        stood = self._stood(probability, self.frames[place.past.begin].time_ns - self.frames[k].time_ns)
+        existence = float(np.clip(place.presence[j] * stood, 0.0, 1.0))
+        smoothed = replace(
+            final, class_probability=probability, existence=existence, modes=modes, ledger={}, visible=True
+        )
         return replace(smoothed, visible=self._in_view(smoothed, k))
 
     def _stood(self, class_probability: Array, before_ns: int) -> float:
@@ -404,15 +458,15 @@ class _Writer:
             return False
         return outlook(self.model.shapes[reported.best_class], frame.T_camera_world @ T, frame.camera).share > 0.0
 
-    def _write_moves(self, row: int, place: _Place, final: Reported) -> None:
+    def _write_moves(self, row: int, place: _Place) -> None:
         """A line for each gap between views that is long enough to hold a move."""
         significant_ns = self.model.config.prediction.significant_period_s * 1e9
-        traced = place.traced.get(final.best_class)
         for j, (a, b) in enumerate(pairwise(place.stages)):
             if b.keyframe >= place.end or b.time_ns - a.time_ns < significant_ns:
                 continue
+            traced = place.traced.get(int(np.argmax(place.class_probability[j + 1])))
             elsewhere = 0.0 if traced is None else traced.elsewhere.get(j + 1, 0.0)
-            moved = place.taken[j] + place.presence[j + 1] * elsewhere
+            moved = place.last[j].sum() + place.presence[j + 1] * elsewhere
             probability = float(np.clip(moved / max(place.presence[j], 1e-12), 0.0, 1.0))
             self.tables.move(row, (a.keyframe, b.keyframe), probability, (a.time_ns, b.time_ns))
 

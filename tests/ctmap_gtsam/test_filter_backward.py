@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.backward import Tracer, _Line, _Link, backward_run, leaving, presence, step_back
+from ctmap_gtsam.filtering.backward import Tracer, _Line, _Link, backward_run, last_there, leaving, step_back
 from ctmap_gtsam.filtering.belief import Updater
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.history import Kept, Past, Stage, one_past
@@ -73,7 +73,7 @@ def test_where_all_is_gaussian_the_smoother_is_that_of_rauch_tung_and_striebel()
     for k in range(1, len(TIMES)):
         belief = updater.step(belief, detection, observation_at(k, detection), Surroundings((), ()))
     assert [stage.keyframe for stage in belief.past.stages] == list(range(len(TIMES)))
-    traced = Tracer(model, LocalisationNoise()).trace(0, belief.past.stages, 0)
+    traced = Tracer(model, LocalisationNoise()).trace(0, belief.past.stages, 0, np.eye(len(TIMES))[-1])
     filtered, _, mean, P = smoothed_by_rts(measured, covariance, model)
     few, farthest = np.inf, 0.0
     for k in reversed(range(len(TIMES))):
@@ -165,31 +165,47 @@ def test_what_has_no_past_is_carried_by_the_prediction():
     np.testing.assert_allclose(steps.std(axis=0), np.repeat([0.01, 0.001], 3), rtol=0.08)
 
 
-def stage_of(k, evidence, clutter=0.0, time_s=None):
+def stage_of(k, evidence, other=-np.inf, clutter=0.0, time_s=None, classes=None):
     time_ns = round((float(k) if time_s is None else time_s) * 1e9)
-    return Stage(k, time_ns, 0.8, {}, np.array([evidence, -np.inf]), clutter)
+    return Stage(k, time_ns, 0.8, classes or {}, np.array([evidence, other]), clutter)
 
 
-def test_presence_is_that_of_all_stories_weighed_one_by_one():
-    """There until a stage and taken away then, there to the end, or never there."""
-    stages = [stage_of(k, e, 2.0) for k, e in enumerate((3.0, 9.0, 14.0, 8.0))]
-    stages.append(stage_of(4, -3.0, 2.0, time_s=100.0))
-    settings = MODEL.config.prediction
-    leave = [settings.jump_probability] * 3 + [1.0 - MODEL.stay_probability(MUG.source, 97.0)]
-    stories = np.exp([3.0, 9.0, 14.0, 8.0]) * leave
+def test_what_is_said_of_presence_and_class_is_all_stories_weighed_one_by_one():
+    """There as a mug or a can until a stage and taken away then, there to the end, or never there."""
+    evidence = np.array([[3.0, 2.0], [9.0, 11.0], [14.0, 12.0], [8.0, 2.0], [-3.0, 1.0]])
+    times = [0.0, 1.0, 2.0, 3.0, 100.0]
+    stages = [stage_of(k, *e, clutter=2.0, time_s=t) for k, (e, t) in enumerate(zip(evidence, times, strict=True))]
+    leave = np.full((4, 2), MODEL.config.prediction.jump_probability)
+    leave[3] = [1.0 - MODEL.stay_probability(shape.source, 97.0) for shape in MODEL.shapes]
+    stories = np.exp(evidence[:4]) * leave
     never = np.exp(2.0) * (1.0 - MODEL.config.detector.unfound) + 1.0
-    end = 0.2
-    there, taken = presence(end, stages, leaving(stages, None, MODEL), MODEL)
-    expected = [end + (1.0 - end) * stories[j:].sum() / (stories.sum() + never) for j in range(5)]
-    np.testing.assert_allclose(there, expected)
-    np.testing.assert_allclose(-np.diff(there), taken[:-1], atol=1e-12)
+    end = np.array([0.05, 0.15])
+    last = last_there(end, leaving(stages, None, MODEL), 2.0, MODEL)
+    np.testing.assert_allclose(last[:4], 0.8 * stories / (stories.sum() + never))
+    np.testing.assert_allclose(last[4], end)
 
 
 def test_what_is_known_to_be_elsewhere_was_there_until_it_was_taken():
     stages = [stage_of(k, e) for k, e in enumerate((20.0, 40.0, 60.0))]
-    there, taken = presence(0.0, stages, leaving(stages, round(3600e9), MODEL), MODEL)
-    np.testing.assert_allclose(there, 1.0, atol=1e-3)
-    assert taken[-1] > 0.99
+    last = last_there(np.zeros(2), leaving(stages, round(3600e9), MODEL), 0.0, MODEL)
+    assert last.sum() == pytest.approx(1.0, abs=1e-3)
+    assert last[-1, 0] > 0.99
+
+
+def test_trajectories_begin_where_the_thing_was_last_there():
+    """What the filter believed of a place after the thing had gone says nothing of where it was."""
+    rng = np.random.default_rng(11)
+    clouds = [kept_cloud(rng, n=30, at=(0.001 * k + 0.2 * (k > 2), 0.0, 0.0), jump=True) for k in range(5)]
+    stages = [stage_of(k, 1.0, classes={0: cloud}) for k, cloud in enumerate(clouds)]
+    tracer = Tracer(MODEL, LocalisationNoise())
+    gone = tracer.trace(0, stages, 0, np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
+    assert sorted(gone.particles) == [0, 1, 2]
+    np.testing.assert_array_equal(gone.at(4).T_world_centre, clouds[2].particles().T_world_centre)
+    assert tracer.trace(0, stages, 1, np.ones(5)) is None
+    half = tracer.trace(0, stages, 0, np.array([0.0, 0.0, 0.5, 0.0, 0.5]))
+    assert sorted(half.particles) == [0, 1, 2, 3, 4]
+    far = np.exp(half.at(3).log_weight)[half.at(3).T_world_centre[:, 0, 3] > 0.1].sum()
+    assert far == pytest.approx(1.0)
 
 
 def test_one_past_of_two_beliefs_begins_with_the_earlier():
