@@ -138,6 +138,7 @@ _COLOURS = {
     "static-fusion": "#8c564b",
     "filter-t": "#e69f00",
     "filter-ct": "#d55e00",
+    "ffbsi-ct": "#44aa99",
     "last-copied-back": "#332288",
     "smooth-t": "#56b4e9",
     "smooth-ct": "#0072b2",
