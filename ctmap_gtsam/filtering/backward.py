@@ -12,8 +12,8 @@ particles and trajectories. No image is looked at again.
 
 Whether the thing was there, and of what class, is weighed beside that, exactly: either it is still there in the end, as
 the filter says then, or it was taken away after one of the keyframes (Equation 3 in absences, the chance of a push in
-view), or never was there; each with the evidence that the filter had collected by then, since what comes later says
-nothing of one that has gone. A trajectory begins where its thing was last there.
+view), or it never was a known thing; each with the evidence that the filter had collected by then, since what comes
+later says nothing of one that has gone. A trajectory begins where its thing was last there.
 
 What has no past among the particles is carried back by the prediction alone: a pose that a search found late and that
 explained the views kept before better, and an object before its track was consistent. It is carried to its first box,
@@ -43,6 +43,7 @@ from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import mixture
+from factors.mixture import log_sum
 from sequences import se3
 from sequences.progress import SILENT, Progress
 from sequences.seeds import generator
@@ -282,19 +283,24 @@ def _log_leave(model: Model, dt_s: float) -> Array:
         return np.log(np.array(left))
 
 
-def last_there(end: Array, left: Array, log_clutter: float, model: Model) -> Array:
+def last_there(end: Array, left: Array, stages: Sequence[Stage], model: Model) -> Array:
     """P(it was there as class c, for the last time at stage j | the whole run) (n, C).
 
-    What is left to one is that it never was there, or is clutter.
+    What is left to one is that nothing ever was there, clutter, or something of unknown mesh that looks alike, and that
+    may have been taken away, too.
 
     Args:
         end: (C,) P(it is there after the last stage, as class c).
         left: (n, C) from `leaving`.
-        log_clutter: log evidence of something that no mesh explains, of all stages.
+        stages: n of one place.
         model: potentials.
     """
-    never = log_clutter + np.log1p(-model.config.detector.unfound)
-    share = np.exp(mixture.normalised(np.concatenate([left.ravel(), [never, 0.0]])))[: left.size]
+    clutter = stages[-1].log_clutter + np.log1p(-model.config.detector.unfound)
+    witness = np.array([stage.witness for stage in stages])
+    alike = float(np.log(model.config.detector.lookalike)) - witness
+    still = log_sum(stages[-1].log_evidence) + alike[-1]
+    rivals = [0.0, clutter, still, *(log_sum(left) + alike)]
+    share = np.exp(mixture.normalised(np.concatenate([left.ravel(), rivals])))[: left.size]
     last = (1.0 - end.sum()) * share.reshape(left.shape)
     last[-1] += end
     return last
@@ -378,7 +384,7 @@ class _Writer:
         """What is said of one place, given what is said of the one after it."""
         until = None if later is None else max(self.frames[later.begin].time_ns, past.stages[-1].time_ns)
         end = final.existence * final.class_probability * (later is None)
-        last = last_there(end, leaving(past.stages, until, self.model), past.stages[-1].log_clutter, self.model)
+        last = last_there(end, leaving(past.stages, until, self.model), past.stages, self.model)
         joint = np.cumsum(last[::-1], axis=0)[::-1]
         there = joint.sum(axis=1)
         probability = joint / np.maximum(there, 1e-300)[:, None]

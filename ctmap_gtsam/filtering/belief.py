@@ -281,6 +281,7 @@ class Updater:
             classes=weighed,
             log_evidence=belief.class_log_evidence(self.model),
             log_clutter=belief.log_clutter,
+            witness=belief.witness,
         )
         return replace(belief, past=past.joined(stage))
 

@@ -53,6 +53,7 @@ class GaussianProposer:
             np.zeros(n),
             np.zeros(n),
             np.array([self.covariance[i] for i in there]).reshape(n, 6, 6),
+            np.zeros(n),
         )
 
     def score(self, shape, view, T):

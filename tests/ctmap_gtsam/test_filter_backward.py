@@ -165,29 +165,35 @@ def test_what_has_no_past_is_carried_by_the_prediction():
     np.testing.assert_allclose(steps.std(axis=0), np.repeat([0.01, 0.001], 3), rtol=0.08)
 
 
-def stage_of(k, evidence, other=-np.inf, clutter=0.0, time_s=None, classes=None):
+def stage_of(k, evidence, other=-np.inf, clutter=0.0, witness=20.0, time_s=None, classes=None):
     time_ns = round((float(k) if time_s is None else time_s) * 1e9)
-    return Stage(k, time_ns, 0.8, classes or {}, np.array([evidence, other]), clutter)
+    return Stage(k, time_ns, 0.8, classes or {}, np.array([evidence, other]), clutter, witness)
 
 
 def test_what_is_said_of_presence_and_class_is_all_stories_weighed_one_by_one():
-    """There as a mug or a can until a stage and taken away then, there to the end, or never there."""
+    """There as a mug or a can until a stage and taken away then, there to the end, or never; or a double."""
     evidence = np.array([[3.0, 2.0], [9.0, 11.0], [14.0, 12.0], [8.0, 2.0], [-3.0, 1.0]])
     times = [0.0, 1.0, 2.0, 3.0, 100.0]
-    stages = [stage_of(k, *e, clutter=2.0, time_s=t) for k, (e, t) in enumerate(zip(evidence, times, strict=True))]
+    witness = np.array([0.5, -1.0, 2.0, 1.0, -3.0])
+    stages = [
+        stage_of(k, *e, clutter=2.0, witness=w, time_s=t)
+        for k, (e, w, t) in enumerate(zip(evidence, witness, times, strict=True))
+    ]
     leave = np.full((4, 2), MODEL.config.prediction.jump_probability)
     leave[3] = [1.0 - MODEL.stay_probability(shape.source, 97.0) for shape in MODEL.shapes]
     stories = np.exp(evidence[:4]) * leave
     never = np.exp(2.0) * (1.0 - MODEL.config.detector.unfound) + 1.0
+    double = MODEL.config.detector.lookalike * np.exp(-witness)
+    never += double[:4] @ stories.sum(axis=1) + double[4] * np.exp(evidence[4]).sum()
     end = np.array([0.05, 0.15])
-    last = last_there(end, leaving(stages, None, MODEL), 2.0, MODEL)
+    last = last_there(end, leaving(stages, None, MODEL), stages, MODEL)
     np.testing.assert_allclose(last[:4], 0.8 * stories / (stories.sum() + never))
     np.testing.assert_allclose(last[4], end)
 
 
 def test_what_is_known_to_be_elsewhere_was_there_until_it_was_taken():
     stages = [stage_of(k, e) for k, e in enumerate((20.0, 40.0, 60.0))]
-    last = last_there(np.zeros(2), leaving(stages, round(3600e9), MODEL), 0.0, MODEL)
+    last = last_there(np.zeros(2), leaving(stages, round(3600e9), MODEL), stages, MODEL)
     assert last.sum() == pytest.approx(1.0, abs=1e-3)
     assert last[-1, 0] > 0.99
 
