@@ -11,6 +11,7 @@ import typer
 
 if TYPE_CHECKING:
     from ctmap_gtsam.estimate import Estimate
+    from ctmap_gtsam.learning.context import Learned
     from ctmap_gtsam.learning.persistence import Persistence
     from ctmap_gtsam.parameters import Smoother
     from sequences.catalogue import Catalogue
@@ -62,6 +63,24 @@ def show_persistence(learned: Sequence[Persistence], catalogue: Catalogue) -> No
                 *(f"{end:.3g}" for end in one.interval_s),
                 one.gaps,
                 f"{one.moves:.1f}",
+            )
+            for one in learned
+        ),
+    )
+
+
+def show_context(learned: Sequence[Learned]) -> None:
+    """Each relation, and how well it is known."""
+    _show_table(
+        ("pairs of", "strength", "from", "to", "distance m", "sigma m", "area m2", "pairs", "independent", "places"),
+        (
+            (
+                "one category" if one.names is None else " and ".join(one.names),
+                *(f"{x:.2f}" for x in (one.relation.strength, *one.strength)),
+                *(f"{x:.3g}" for x in (one.relation.distance_m, one.relation.sigma_m, one.relation.area_m2 or 0.0)),
+                one.pairs,
+                f"{one.independent:.1f}",
+                one.places,
             )
             for one in learned
         ),
