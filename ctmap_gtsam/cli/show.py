@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from ctmap_gtsam.config import Config
     from ctmap_gtsam.estimate import Estimate
+    from ctmap_gtsam.learning.calibration import Calibration, Fitted
     from ctmap_gtsam.learning.context import Learned
     from ctmap_gtsam.learning.persistence import Persistence
     from ctmap_gtsam.parameters import Smoother
@@ -85,6 +87,30 @@ def show_context(learned: Sequence[Learned]) -> None:
             for one in learned
         ),
     )
+
+
+def show_calibration(calibration: Calibration, config: Config) -> None:
+    """Each setting as it was and as each length of run has it; then where these disagree, on stderr."""
+    _show_table(
+        ("setting", "was", *(f"{name} (95 %)" for name in calibration.lengths), "object-visits"),
+        (
+            (
+                f"{one.section}.{one.name}",
+                f"{getattr(getattr(config, one.section), one.name):g}",
+                *map(_with_interval, (one, *calibration.beside(one).values())),
+                one.visits,
+            )
+            for one in calibration.fitted
+        ),
+    )
+    for one, length, other in calibration.disagreeing():
+        setting = f"{one.section}.{one.name}"
+        message = f"{setting} hangs on the run's length: {_with_interval(one)}, {length} {_with_interval(other)}"
+        typer.echo(f"warning: {message}", err=True)
+
+
+def _with_interval(one: Fitted) -> str:
+    return f"{one.value:.3g} ({one.interval[0]:.3g} to {one.interval[1]:.3g})"
 
 
 def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:

@@ -147,7 +147,7 @@ def pairs_of(place: int, visits: Sequence[Mapping[int, Standing]], catalogue: Ca
         for i, j in combinations(sorted(standing), 2):
             if not (i in still and j in still):
                 obj_ids = (standing[i].obj_id, standing[j].obj_id)
-                weight = _independent(*(catalogue[o].category for o in obj_ids), members)
+                weight = _independent(catalogue[obj_ids[0]].category, catalogue[obj_ids[1]].category, members)
                 pairs.append(Pair(place, obj_ids, float(np.linalg.norm(centres[i] - centres[j])), weight))
         before = dict(standing)
     return pairs
@@ -251,7 +251,7 @@ class _Table:
         )
 
     def gain(self, own: Learned, anyway: Learned | None, rows: NDArray[np.bool_]) -> float:
-        """Nats by which a relation of their own, whatever it is, explains pairs `rows` better than what holds anyway."""
+        """Nats by which a relation of their own explains pairs `rows` better than what holds for them anyway."""
         rows = self._of_one_kind(rows)
         relation = Relation(strength=0.0) if anyway is None else anyway.relation
         if not self.comparable[rows].all():
@@ -328,6 +328,8 @@ def described(learned: Sequence[Learned]) -> str:
 
 
 def _known(one: Learned) -> str:
+    if np.isneginf(one.log_evidence):
+        return f"nothing of two categories to hold its {one.pairs} pairs to: no relation"
     ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in _intervals(one).items())
     return f"{', '.join(ranges)}; {one.pairs} pairs, as {one.independent:.1f}, in {one.places} places"
 
