@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.config import Config
-from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.learning.depth import DepthFit, DepthStatistics, View, views_of
 from ctmap_gtsam.learning.detections import DetectorFit, DetectorStatistics, Sight, sights_of
-from ctmap_gtsam.learning.sources import load_sources
+from ctmap_gtsam.learning.sources import truth_of
+from sequences.bop import load_run
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
 from sequences.seeds import generator
@@ -76,7 +76,7 @@ def calibrate(runs: Sequence[Path], config: Config, every: int = 3, progress: Pr
     """Fit the settings to runs on disk.
 
     Args:
-        runs: folders of runs with truth.
+        runs: folders of runs with truth, of any catalogues.
         config: what isn't fitted: outliers, steps of the samples; and where the search starts.
         every: the second length is every so-many-th frame.
         progress: is told of each run, then of each fit.
@@ -112,14 +112,14 @@ def fit_lengths(
 
 
 def _gather(runs: Sequence[Path], config: Config, progress: Progress) -> tuple[list[View], list[Sight]]:
-    _, sources = load_sources(runs)
     views: list[View] = []
     sights: list[Sight] = []
-    with progress.stage("depth at true poses", total=len(sources)) as stage:
-        for source in sources:
-            assert not isinstance(source.known, Estimate)  # none is given
-            views += views_of(source.run, source.known, config, 1 + max((v.visit for v in views), default=-1))
-            sights += sights_of(source.run, source.known, config, 1 + max((s.visit for s in sights), default=-1))
+    with progress.stage("depth at true poses", total=len(runs)) as stage:
+        for path in runs:
+            run = load_run(path)
+            truth = truth_of(path, run)
+            views += views_of(run, truth, config, 1 + max((v.visit for v in views), default=-1))
+            sights += sights_of(run, truth, config, 1 + max((s.visit for s in sights), default=-1))
             stage.advance()
     if len({v.visit for v in views}) < LEAST_VISITS:
         raise InputError(

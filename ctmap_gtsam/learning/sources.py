@@ -47,17 +47,18 @@ def load_sources(runs: Sequence[Path], estimates: Sequence[Path] = ()) -> tuple[
     for path, run in zip(runs, loaded, strict=True):
         _join(classes, run.catalogue, path)
         given = of_run.pop(run.fingerprint, None)
-        sources.append(Source(run, _true(path, run) if given is None else given[1]))
+        sources.append(Source(run, truth_of(path, run) if given is None else given[1]))
     if of_run:
         file = next(iter(of_run.values()))[0]
         raise InputError("it is of none of the runs", file=file, field="meta.fingerprint", remedy="name its run, too")
     return Catalogue(tuple(c for _, c in sorted(classes.items()))), tuple(sources)
 
 
-def _true(path: Path, run: Run) -> Truth:
+def truth_of(path: Path, run: Run) -> Truth:
+    """The truth of a run in a folder; InputError where it has none."""
     truth = load_truth(run)
     if truth is None:
-        remedy = "smooth the run and give the result with --estimate"
+        remedy = "give a run with truth; persistence and context take an --estimate of it instead"
         raise InputError("the run has no truth", file=path, field=layout.SCENE_GT, remedy=remedy)
     return truth
 
