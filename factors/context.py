@@ -16,8 +16,8 @@ strangers are, uniformly over the place's area A:
 
 Pairs of one category are related, and so are the class pairs of a table (a mouse beside a keyboard).
 
-**Instance level.** phi_ins / phi_background is learned from other visits and comes in as a number; it is 1 until
-something is known.
+**Instance level.** phi_ins / phi_background is learned from other visits (`factors.instance`) and comes in as a number;
+it is 1 until something is known.
 
 **Physics.** Penetration and floating are matters of possibility, not of likelihood: they are hinges outside the
 mixture, -1/2 (max(0, excess) / sigma)^2, so that no weight w1 can buy them off.

@@ -1,8 +1,8 @@
 """phi_ins of Equation 5: how two things of one place stood to each other in other visits.
 
 The relative pose X = T_a^-1 T_b of two objects, one observation a visit, is Gaussian about a mean that the place has,
-with mean and covariance unknown. Under a Normal-inverse-Wishart prior (Gelman et al., Bayesian Data Analysis, 3.6), flat
-in the mean, what n visits predict of another is a Student t in d dimensions,
+with mean and covariance unknown. Under a Normal-inverse-Wishart prior (Gelman et al., Bayesian Data Analysis, 3.6),
+flat in the mean, what n visits predict of another is a Student t in d dimensions,
 
     t(r; 0, Psi_n (n + 1) / (n k), k),     k = nu_n - d + 1,    nu_n = nu_0 + n,    Psi_n = Psi_0 + scatter,
 
