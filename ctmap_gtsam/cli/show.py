@@ -91,13 +91,15 @@ def show_context(learned: Sequence[Learned]) -> None:
 
 def show_calibration(calibration: Calibration, config: Config) -> None:
     """Each setting as it was and as each length of run has it; then where these disagree, on stderr."""
+    from ctmap_gtsam.learning.calibration import ALL
+
     _show_table(
         ("setting", "was", *(f"{name} (95 %)" for name in calibration.lengths), "object-visits"),
         (
             (
                 f"{one.section}.{one.name}",
                 f"{getattr(getattr(config, one.section), one.name):g}",
-                *map(_with_interval, (one, *calibration.beside(one).values())),
+                *(_with_interval({**calibration.beside(one), ALL: one}.get(name)) for name in calibration.lengths),
                 one.visits,
             )
             for one in calibration.fitted
@@ -109,8 +111,9 @@ def show_calibration(calibration: Calibration, config: Config) -> None:
         typer.echo(f"warning: {message}", err=True)
 
 
-def _with_interval(one: Fitted) -> str:
-    return f"{one.value:.3g} ({one.interval[0]:.3g} to {one.interval[1]:.3g})"
+def _with_interval(one: Fitted | None) -> str:
+    """Nothing where a run of that length says nothing of it."""
+    return "" if one is None else f"{one.value:.3g} ({one.interval[0]:.3g} to {one.interval[1]:.3g})"
 
 
 def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:

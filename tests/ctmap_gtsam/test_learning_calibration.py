@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from ctmap_gtsam.bench.realism.residuals import glances
 from ctmap_gtsam.cli.app import app
+from ctmap_gtsam.cli.show import show_calibration
 from ctmap_gtsam.config import Config, load_config
 from ctmap_gtsam.learning import calibration as calibration_module
 from ctmap_gtsam.learning.calibration import ALL, Calibration, Fitted, described, fit_lengths
@@ -243,6 +244,14 @@ def test_the_file_says_what_each_length_says():
     calibration = Calibration({ALL: (here,), "first halves": (there,)})
     assert "first halves 0.9" in described(calibration)
     assert calibration.disagreeing() == [(here, "first halves", there)]
+
+
+def test_what_disagrees_is_said_and_what_is_missing_leaves_a_gap(capsys):
+    here, there = (Fitted("sensor", "kappa", v, (v / 2, v * 2), 7) for v in (0.01, 0.9))
+    show_calibration(Calibration({ALL: (here,), "1 frame in 3": (), "first halves": (there,)}), CONFIG)
+    shown = capsys.readouterr()
+    assert "0.01 (0.005 to 0.02)" in shown.out
+    assert "sensor.kappa hangs on the run's length" in shown.err
 
 
 def test_bad_input_is_named(tmp_path):

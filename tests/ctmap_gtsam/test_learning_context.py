@@ -30,7 +30,7 @@ from sequences.simulation.motion import arrange
 from sequences.simulation.place import furnish
 from tests.ctmap_gtsam import synthetic
 
-PLACES = 12
+PLACES = 10
 
 
 @lru_cache(maxsize=2)
@@ -122,7 +122,7 @@ def drawn(rng, obj_ids, n, strength, m=0.0, s=0.25, area=16.0):
 
 
 def test_the_interval_holds_the_strength_as_often_as_it_says():
-    rng, n = np.random.default_rng(0), 40
+    rng, n = np.random.default_rng(0), 25
     inside = 0
     for _ in range(n):
         pairs = drawn(rng, (1, 2), 60, 0.5, 0.3, 0.1) + drawn(rng, (1, 3), 300, 0.0)

@@ -38,7 +38,7 @@ def pair(rng, first, second, n=3):
 
 
 @given(SEEDS, FIRST, SECOND)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_symmetries_change_nothing(seed, first, second):
     rng = np.random.default_rng(seed)
     T_a, T_b, relation, a, b = pair(rng, first, second)
@@ -50,7 +50,7 @@ def test_symmetries_change_nothing(seed, first, second):
 
 
 @given(SEEDS, FIRST, SECOND)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_jacobians_are_the_derivatives(seed, first, second):
     rng = np.random.default_rng(seed)
     T_a, T_b, relation, a, b = pair(rng, first, second)
