@@ -144,7 +144,7 @@ def build_shapes(catalogue: Catalogue, faces: int) -> tuple[Shape, ...]:
 def _build(index: int, source: ObjectClass, faces: int) -> Shape:
     coarse = simplify(source.mesh, faces)
     symmetry = Symmetry.of(source)
-    centre = _centre(source, symmetry)
+    centre = centre_of(source)
     mesh = Mesh(np.ascontiguousarray(coarse.vertices - centre), np.ascontiguousarray(coarse.faces), coarse.colours)
     return Shape(
         index=index,
@@ -157,11 +157,11 @@ def _build(index: int, source: ObjectClass, faces: int) -> Shape:
     )
 
 
-def _centre(source: ObjectClass, symmetry: Symmetry) -> Array:
-    """The fixed point of all symmetries nearest to the middle of the bounding box: (3,) in the mesh frame."""
+def centre_of(source: ObjectClass) -> Array:
+    """The fixed point of all symmetries nearest to the middle of the bounding box: (3,) in the mesh frame, metres."""
     vertices = source.mesh.vertices
     middle = np.asarray((vertices.min(0) + vertices.max(0)) / 2.0)
-    return middle + _about(symmetry, middle).centre
+    return middle + _about(Symmetry.of(source), middle).centre
 
 
 def _about(symmetry: Symmetry, origin: Array) -> Symmetry:

@@ -16,8 +16,8 @@ strangers are, uniformly over the place's area A:
 
 Pairs of one category are related, and so are the class pairs of a table (a mouse beside a keyboard).
 
-**Instance level.** phi_ins / phi_background is learned from other visits and comes in as a number; it is 1 until
-something is known.
+**Instance level.** phi_ins / phi_background is learned from other visits (`factors.instance`) and comes in as a number;
+it is 1 until something is known.
 
 **Physics.** Penetration and floating are matters of possibility, not of likelihood: they are hinges outside the
 mixture, -1/2 (max(0, excess) / sigma)^2, so that no weight w1 can buy them off.
@@ -49,11 +49,20 @@ class Relation:
     strength: float = option(0.3, "probability that a pair is placed together rather than anywhere", low=0.0, high=1.0)
     distance_m: float = option(0.0, "usual distance between their centres, metres", low=0.0)
     sigma_m: float = option(0.25, "standard deviation of that distance, metres", low=1e-3)
+    area_m2: float | None = option(
+        None,
+        "area over which unrelated things are spread, as seen at that distance; else that of all relations",
+        low=1e-3,
+    )
+
+    def mean_bell(self, area_m2: float) -> float:
+        """Mean of exp(-(d - m)^2 / 2 s^2) over unrelated pairs: those spread uniformly over an area of the plane."""
+        return plane_integral(self.distance_m, self.sigma_m) / (self.area_m2 or area_m2)
 
 
 @dataclass(frozen=True)
 class CategoryRelations:
-    """The category-level prior, encoded by hand as in the paper."""
+    """The category-level prior: by hand, as in the paper, or learned (`ctmap train context`)."""
 
     same_category: Relation = Relation()
     """pairs of classes that share a category"""
@@ -90,14 +99,18 @@ class PairMixture:
 
 def pair_mixture(relation: Relation, area_m2: float, category_weight: float = 0.5) -> PairMixture:
     """The mixture (shape ()) of one related pair in a place of some area, with w1 the category's weight."""
-    s, m = relation.sigma_m, relation.distance_m
-    # integral of exp(-(d - m)^2 / 2 s^2) over the plane, in polar coordinates
-    tail = m * s * math.sqrt(0.5 * math.pi) * (1.0 + math.erf(m / (s * math.sqrt(2.0))))
-    plane = 2.0 * math.pi * (s * s * math.exp(-0.5 * (m / s) ** 2) + tail)
     strangers = category_weight * (1.0 - relation.strength)
-    together = category_weight * relation.strength * area_m2 / plane
-    arrays = [np.asarray(value, dtype=np.float64) for value in (strangers, together, m, s)]
+    together = category_weight * relation.strength / relation.mean_bell(area_m2)
+    values = (strangers, together, relation.distance_m, relation.sigma_m)
+    arrays = [np.asarray(value, dtype=np.float64) for value in values]
     return PairMixture(arrays[0], arrays[1], arrays[2], arrays[3], 1.0 - category_weight)
+
+
+def plane_integral(distance_m: float, sigma_m: float) -> float:
+    """Z(m, s), square metres: the integral of exp(-(d - m)^2 / 2 s^2) over the plane, d from a point of it."""
+    m, s = distance_m, sigma_m  # in polar coordinates
+    tail = m * s * math.sqrt(0.5 * math.pi) * (1.0 + math.erf(m / (s * math.sqrt(2.0))))
+    return 2.0 * math.pi * (s * s * math.exp(-0.5 * (m / s) ** 2) + tail)
 
 
 def relation_table(names: Sequence[str], categories: Sequence[str], relations: CategoryRelations) -> PairMixture:

@@ -265,22 +265,37 @@ def correlated_pixels(residuals: ArrayLike) -> float:
         ValueError: where no residual is finite and different from zero.
     """
     images = np.asarray(residuals, dtype=np.float64)
+    number = int(np.prod(images.shape[:-2]))
+    return correlated_pixels_of(lag_products(images), np.isfinite(images).sum() / number)
+
+
+def lag_products(residuals: ArrayLike) -> Array:
+    """Products of all pairs of pixels, added over images and by their distance: (R,), rounded to 0, 1, ... pixels.
+
+    Args:
+        residuals: (..., h, w); NaN where nothing was compared.
+    """
+    images = np.asarray(residuals, dtype=np.float64)
     images = images.reshape(-1, *images.shape[-2:])
     height, width = images.shape[1:]
-    mask = np.isfinite(images)
-    values = np.where(mask, images, 0.0)
-    # the products of all pairs of pixels by their lag, added over images; zero padding keeps lags from wrapping round
+    values = np.where(np.isfinite(images), images, 0.0)
+    # zero padding keeps lags from wrapping round
     spectrum = np.fft.rfft2(values, s=(2 * height, 2 * width))
     products = np.fft.irfft2((spectrum * spectrum.conj()).sum(axis=0).real, s=(2 * height, 2 * width))
-    power = float((values**2).sum())
-    if not power > 0.0:
-        raise ValueError("correlated_pixels needs residuals that are finite and not all zero")
     lag_v, lag_u = np.fft.fftfreq(2 * height, 0.5 / height), np.fft.fftfreq(2 * width, 0.5 / width)
     ring = np.rint(np.hypot(lag_v[:, None], lag_u[None, :])).astype(np.int64)
-    by_ring = np.bincount(ring.ravel(), weights=products.ravel())
+    return np.asarray(np.bincount(ring.ravel(), weights=products.ravel()), dtype=np.float64)
+
+
+def correlated_pixels_of(products: ArrayLike, most: float) -> float:
+    """`correlated_pixels` from the sums (R,) of `lag_products`, and the mean number of compared pixels an image."""
+    by_ring = np.asarray(products, dtype=np.float64)
+    power = float(by_ring[0])
+    if not power > 0.0:
+        raise ValueError("correlated_pixels needs residuals that are finite and not all zero")
     ended = np.flatnonzero(by_ring <= 1e-9 * power)
     total = by_ring[: ended[0]].sum() if len(ended) else by_ring.sum()
-    return float(np.clip(total / power, 1.0, mask.sum() / len(images)))
+    return float(np.clip(total / power, 1.0, most))
 
 
 def detection_log_ratio(

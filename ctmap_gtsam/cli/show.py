@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from ctmap_gtsam.config import Config
     from ctmap_gtsam.estimate import Estimate
+    from ctmap_gtsam.learning.calibration import Calibration, Fitted
+    from ctmap_gtsam.learning.context import Learned
     from ctmap_gtsam.learning.persistence import Persistence
     from ctmap_gtsam.parameters import Smoother
     from sequences.catalogue import Catalogue
@@ -66,6 +69,51 @@ def show_persistence(learned: Sequence[Persistence], catalogue: Catalogue) -> No
             for one in learned
         ),
     )
+
+
+def show_context(learned: Sequence[Learned]) -> None:
+    """Each relation, and how well it is known."""
+    _show_table(
+        ("pairs of", "strength", "from", "to", "distance m", "sigma m", "area m2", "pairs", "independent", "places"),
+        (
+            (
+                "one category" if one.names is None else " and ".join(one.names),
+                *(f"{x:.2f}" for x in (one.relation.strength, *one.strength)),
+                *(f"{x:.3g}" for x in (one.relation.distance_m, one.relation.sigma_m, one.relation.area_m2 or 0.0)),
+                one.pairs,
+                f"{one.independent:.1f}",
+                one.places,
+            )
+            for one in learned
+        ),
+    )
+
+
+def show_calibration(calibration: Calibration, config: Config) -> None:
+    """Each setting as it was and as each length of run has it; then where these disagree, on stderr."""
+    from ctmap_gtsam.learning.calibration import ALL
+
+    _show_table(
+        ("setting", "was", *(f"{name} (95 %)" for name in calibration.lengths), "object-visits"),
+        (
+            (
+                f"{one.section}.{one.name}",
+                f"{getattr(getattr(config, one.section), one.name):g}",
+                *(_with_interval({**calibration.beside(one), ALL: one}.get(name)) for name in calibration.lengths),
+                one.visits,
+            )
+            for one in calibration.fitted
+        ),
+    )
+    for one, length, other in calibration.disagreeing():
+        setting = f"{one.section}.{one.name}"
+        message = f"{setting} hangs on the run's length: {_with_interval(one)}, {length} {_with_interval(other)}"
+        typer.echo(f"warning: {message}", err=True)
+
+
+def _with_interval(one: Fitted | None) -> str:
+    """Nothing where a run of that length says nothing of it."""
+    return "" if one is None else f"{one.value:.3g} ({one.interval[0]:.3g} to {one.interval[1]:.3g})"
 
 
 def show_estimate(estimate: Estimate, catalogue: Catalogue) -> None:

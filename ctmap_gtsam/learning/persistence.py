@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.learning.sources import Source, load_sources, same_place
 from factors.persistence import stay_probability
-from sequences import layout, se3
-from sequences.bop import load_run, load_truth
 from sequences.catalogue import Catalogue, ObjectClass
 from sequences.errors import InputError
 from sequences.types import Run, TrueObject, Truth
@@ -38,7 +37,6 @@ LEVEL = 0.95
 """of the interval that is stated"""
 
 _GRID = 2000
-_SAME_POSE = (0.1, 0.02)  # rad, metres: the truth of what was not touched differs by less
 _SUREST = 1e-9  # no estimate is believed to be surer of a move, or of a stay
 
 
@@ -93,8 +91,7 @@ def _elsewhere(thing: TrueObject, before: int, after: int) -> bool:
     a, b = (np.flatnonzero(thing.frames == f) for f in (before, after))
     if not len(b):
         return True
-    xi = se3.local(thing.T_world_object[a[0]], thing.T_world_object[b[0]])
-    return bool(np.linalg.norm(xi[:3]) > _SAME_POSE[0] or np.linalg.norm(xi[3:]) > _SAME_POSE[1])
+    return not same_place(thing.T_world_object[a[0]], thing.T_world_object[b[0]])
 
 
 def gaps_of_estimate(run: Run, estimate: Estimate) -> list[Gap]:
@@ -183,20 +180,8 @@ def learn_from(
         InputError: a file is broken; a run has neither truth nor estimate, or calls a class something else than another
             run does; an estimate is of none of the runs; there is no gap at all.
     """
-    of_run = {str(e.meta["fingerprint"]): (path, e) for path in estimates for e in (Estimate.load(path),)}
-    loaded = [load_run(path) for path in runs]
-    gaps: list[Gap] = []
-    classes: dict[int, ObjectClass] = {}
-    for path, run in zip(runs, loaded, strict=True):
-        _join(classes, run.catalogue, path)
-        if run.fingerprint in of_run:
-            gaps += gaps_of_estimate(run, of_run.pop(run.fingerprint)[1])
-        else:
-            gaps += _true_gaps(path, run)
-    if of_run:
-        file = next(iter(of_run.values()))[0]
-        raise InputError("it is of none of the runs", file=file, field="meta.fingerprint", remedy="name its run, too")
-    catalogue = Catalogue(tuple(c for _, c in sorted(classes.items())))
+    catalogue, sources = load_sources(runs, estimates)
+    gaps = [gap for source in sources for gap in _gaps(source)]
     learned = learn(gaps, catalogue, by=lambda c: c.category if by == "category" else c.obj_id)
     if not learned:
         raise InputError(
@@ -205,25 +190,10 @@ def learn_from(
     return catalogue, learned
 
 
-def _true_gaps(path: Path, run: Run) -> list[Gap]:
-    truth = load_truth(run)
-    if truth is None:
-        remedy = "smooth the run and give the result with --estimate"
-        raise InputError("the run has no truth", file=path, field=layout.SCENE_GT, remedy=remedy)
-    return gaps_of_truth(run, truth)
-
-
-def _join(classes: dict[int, ObjectClass], own: Catalogue, path: Path) -> None:
-    """Add a run's classes to those of the others."""
-    for c in own.classes:
-        known = classes.setdefault(c.obj_id, c)
-        if (known.name, known.category) != (c.name, c.category):
-            raise InputError(
-                f"it is {c.name} of category {c.category}, in another run {known.name} of {known.category}",
-                file=path / layout.CATALOGUE,
-                field=str(c.obj_id),
-                remedy="learn from runs whose obj_ids are the same classes",
-            )
+def _gaps(source: Source) -> list[Gap]:
+    if isinstance(source.known, Estimate):
+        return gaps_of_estimate(source.run, source.known)
+    return gaps_of_truth(source.run, source.known)
 
 
 def described(catalogue: Catalogue, learned: Sequence[Persistence]) -> Mapping[str, Any]:

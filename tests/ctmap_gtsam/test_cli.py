@@ -21,6 +21,8 @@ COMMANDS = [
     ["compare"],
     ["report"],
     ["train", "persistence"],
+    ["train", "context"],
+    ["train", "calibration"],
     ["bench", "render"],
     ["bench", "paper"],
 ]

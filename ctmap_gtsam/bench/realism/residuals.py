@@ -70,6 +70,28 @@ class Glance:
     """of the angle of incidence"""
     points: Array
     """(h, w, 3) true surface, object frame, metres"""
+    normal: NDArray[np.float32]
+    """(h, w, 3) its unit normal, object frame"""
+    T_camera_object: Array
+    """(4, 4)"""
+
+    @property
+    def depth(self) -> Array:
+        """(h, w) of the true surface, metres."""
+        return self.points @ self.T_camera_object[2, :3] + self.T_camera_object[2, 3]
+
+    def jacobian(self, centre: Array) -> Array:
+        """By how much depth grows with the object's pose: (h, w, 6), metres per rad and per metre; 0 at grazing angles.
+
+        A surface point p with normal n that moves by d meets its line of sight n.d / n.ray further away. The pose is
+        perturbed from the right, about a centre (3,) of the object frame.
+        """
+        normal = self.normal.astype(np.float64)
+        ray = (self.points - se3.inverse(self.T_camera_object)[:3, 3]) / np.maximum(self.depth, 1e-9)[..., None]
+        towards = np.einsum("hwk,hwk->hw", normal, ray)[..., None]
+        along = np.concatenate([np.cross(self.points - centre, normal), normal], axis=-1)
+        flat = self.cosine[..., None] > LEAST_COSINE
+        return np.divide(along, towards, out=np.zeros_like(along), where=flat & (towards != 0.0))
 
     @property
     def pixels_per_metre(self) -> float:
@@ -166,6 +188,8 @@ def _glance(
         flying=mask & (seen > 0.0) & (np.abs(residual) > FLYING_M),
         cosine=cosine,
         points=se3.transform(se3.inverse(item[1]), ray * true[..., None]),
+        normal=(normal @ item[1][:3, :3]).astype(np.float32),
+        T_camera_object=item[1],
     )
 
 
