@@ -2,14 +2,19 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from ctmap_gtsam.bench import run_bench
 from ctmap_gtsam.cli.app import app
+from ctmap_gtsam.cli.show import show_solver
 from ctmap_gtsam.config import Config, load_config
+from ctmap_gtsam.estimate import Estimate
 from sequences.errors import InputError
+from tests.ctmap_gtsam.scenes import CHEAP
+from tests.ctmap_gtsam.synthetic import write_run
 
 COMMANDS = [
     ["demo"],
@@ -25,6 +30,7 @@ COMMANDS = [
     ["train", "calibration"],
     ["bench", "render"],
     ["bench", "paper"],
+    ["bench", "solver"],
 ]
 HEAVY = ("cv2", "gtsam", "numba", "numpy", "open3d", "pandas", "pyrender", "scipy", "trimesh")
 
@@ -160,3 +166,29 @@ def test_ctrl_c_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_the_paper_has_not_is_one_clean_error(wrong: tuple[str, str], word: str, tmp_path: Path) -> None:
     assert_clean_error(ctmap("bench", "paper", "--out", tmp_path / "out", *wrong), word)
     assert not (tmp_path / "out").exists()
+
+
+def test_smooth_shows_its_graph_and_says_where_it_hasnt_converged(tmp_path: Path) -> None:
+    run, out = write_run(tmp_path / "run", frames=3), tmp_path / "out"
+    cheap = [word for setting in (*CHEAP, "smoother.max_iterations=1") for word in ("--set", setting)]
+    done = ctmap("smooth", run, "--out", out, "--graph", out / "graph", *cheap)
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in (out / "graph").iterdir()} == {"factors.csv", "graph.dot", "graph.g2o", "graph.png"}
+    told = Estimate.load(out / "smooth-ct.npz").meta["diagnostics"]
+    lines = (out / "graph" / "factors.csv").read_text().splitlines()[1:]
+    assert len(lines) == sum(told["factors"].values())
+    errors = sum(float(line.split(",")[-1]) for line in lines)
+    assert errors == pytest.approx(told["solver"]["trace"][-1], rel=1e-6)
+    assert told["solver"]["end"] == "cap"
+    assert "hasn't converged" in done.stderr
+    assert "smoother.max_iterations = 1" in done.stderr
+
+
+@pytest.mark.parametrize(("end", "words"), [("converged", ""), ("cap", "by 0.25 of 1.5 nats"), ("stalled", "stalled")])
+def test_the_solvers_end_is_told_where_it_is_none(end: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate = SimpleNamespace(meta={"diagnostics": {"solver": {"end": end, "trace": [9.0, 1.75, 1.5]}}})
+    show_solver(estimate, Config().smoother)
+    told = capsys.readouterr()
+    assert not told.out
+    assert bool(told.err) == bool(words)
+    assert words in told.err
