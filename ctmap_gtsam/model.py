@@ -152,17 +152,20 @@ class Model:
         """(C,) log evidence of the true class c from class_scores (C,) summed over a track and visit: saturating."""
         return persistent_class_log_evidence(summed, self.log_confusion)
 
-    def clutter_detection(self, visible: Array, detection: Detection | None, image_size: tuple[int, int]) -> Array:
+    def clutter_detection(
+        self, visible: Array, detection: Detection | None, image_size: tuple[int, int], first: bool
+    ) -> Array:
         """log of the detection potential (K,) of something that no mesh explains, of which shares (K,) are visible.
 
         Its boxes come less often than a known thing's, and jitter, too, about one that nobody knows: a nat is what an
-        edge of Laplace's density expects to lose.
+        edge of Laplace's density expects to lose. Nothing foretells its first box, which may be anywhere.
         """
         rate = self.config.detector.clutter_rate
         if detection is None:
             return np.log1p(-rate * visible)
         box = np.array(detection.box)
-        return np.full(len(visible), np.log(rate) + float(self.box(box, box[None], image_size)[0]) - _EDGES)
+        fit = 0.0 if first else float(self.box(box, box[None], image_size)[0]) - _EDGES
+        return np.full(len(visible), np.log(rate) + fit)
 
     def witness(self, scores: Scores, detected: bool) -> Array:
         """What a track's box in a view, or the lack of one, says (K,) for a known thing against a look-alike, nats.

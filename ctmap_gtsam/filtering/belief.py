@@ -560,7 +560,7 @@ class Updater:
         shape, T = self.model.shapes[best], observation.frame.T_camera_world @ own.particles.best(1)[0]
         return replace(
             belief,
-            log_clutter=belief.log_clutter + self.proposer.log_clutter(shape, view, T),
+            log_clutter=belief.log_clutter + self.proposer.log_clutter(shape, view, T, first=belief.steps == 1),
             witness=belief.witness + self.proposer.witness(shape, view, T),
         )
 

@@ -233,12 +233,18 @@ class Proposer:
         poses = np.concatenate([T_camera_centre[None], drawn]) if within else T_camera_centre[None]
         return float(self.score(shape, view, poses)[0].max())
 
-    def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
+    def log_clutter(self, shape: Shape, view: View, T_camera_centre: Array, first: bool) -> float:
         """What a view says for something that no mesh explains, of the silhouette of one pose (4, 4), nats.
 
         A surface of unknown form explains a share of what the right mesh would, where the background doesn't explain
         the depth already; its boxes come less often, and fit as well. It has gone where most of the silhouette is seen
         through.
+
+        Args:
+            shape: the class.
+            view: where to look.
+            T_camera_centre: the pose.
+            first: whether this is the first view of it.
         """
         sensor = self.model.config.sensor
         rendered = Rasteriser().render(shape.mesh, view.tile.camera, T_camera_centre[None])[0]
@@ -247,7 +253,7 @@ class Proposer:
         seen = measured & (z > rendered - sensor.occlusion_margin_m)
         sample = view.samples * self.model.kappa * sensor.clutter_gain
         visible = np.array([seen.sum() / max(int(measured.sum()), 1)])
-        boxes = float(self.model.clutter_detection(visible, view.detection, view.image_size)[0])
+        boxes = float(self.model.clutter_detection(visible, view.detection, view.image_size, first)[0])
         if view.detection is None:
             through = measured & (z > rendered + sensor.occlusion_margin_m)
             empty = float(max(2 * int(through.sum()) - int(measured.sum()), 0))

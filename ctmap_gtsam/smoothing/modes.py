@@ -173,11 +173,11 @@ def _sight(
         modes.append(found)
         poses = observation.frame.T_world_camera @ found.T_camera_centre
         context.append(around.log_potential(model, shape, poses))
-    clutter = _log_clutter(proposer, view, modes)
+    clutter = _log_clutter(proposer, view, modes, first=last is None)
     return Sighting(observation.keyframe, tuple(modes), tuple(context), clutter), (viewpoint, time_s)
 
 
-def _log_clutter(proposer: Proposer, view: View, modes: list[PoseModes | None]) -> float:
+def _log_clutter(proposer: Proposer, view: View, modes: list[PoseModes | None], first: bool) -> float:
     """Of the silhouette that explains the view best."""
     best = [(float(m.log_likelihood[0]), c) for c, m in enumerate(modes) if m is not None and len(m)]
     if not best:
@@ -185,7 +185,7 @@ def _log_clutter(proposer: Proposer, view: View, modes: list[PoseModes | None]) 
     c = max(best)[1]
     found = modes[c]
     assert found is not None
-    return proposer.log_clutter(proposer.model.shapes[c], view, found.T_camera_centre[0])
+    return proposer.log_clutter(proposer.model.shapes[c], view, found.T_camera_centre[0], first)
 
 
 def _viewpoint(wish: Wanted, observation: Observation) -> Array:

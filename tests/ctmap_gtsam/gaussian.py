@@ -65,7 +65,7 @@ class GaussianProposer:
     def near(self, shape, view, T, reach):
         return float(self.score(shape, view, T[None])[0][0])
 
-    def log_clutter(self, shape, view, T):
+    def log_clutter(self, shape, view, T, first):
         return 0.0
 
     def witness(self, shape, view, T):
