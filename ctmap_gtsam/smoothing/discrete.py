@@ -54,7 +54,7 @@ class Posterior:
     modes: tuple[Array, ...]
     """(n + 2,) marginal of each stage's states: modes, unmeasured, gone"""
     path: tuple[int, ...]
-    """the most probable states; n stands for unmeasured, n + 1 for gone"""
+    """the most probable states, given where it is likelier there than gone; n stands for unmeasured, n + 1 for gone"""
     moved: Array
     """(stages - 1,) probability that the object was there at either of two stages and did not simply stay"""
 
@@ -85,7 +85,7 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
     total = float(log_sum(forward[-1]))
     marginals = tuple(np.exp(f + b - total) for f, b in zip(forward, backward, strict=True))
     moved = [_moved(step, forward[i], emissions[i + 1] + backward[i + 1], total) for i, step in enumerate(steps)]
-    return Posterior(total, marginals, _viterbi(start, emissions, steps), np.array(moved))
+    return Posterior(total, marginals, _best_path(start, emissions, steps, marginals), np.array(moved))
 
 
 @dataclass(frozen=True)
@@ -192,14 +192,26 @@ def _moved(step: _Step, forward: Array, ahead: Array, total: float) -> float:
     return float(np.clip(1.0 - gone - stayed, 0.0, 1.0))
 
 
-def _viterbi(start: Array, emissions: list[Array], steps: list[_Step]) -> tuple[int, ...]:
-    score = start + emissions[0]
+def _best_path(start: Array, emissions: list[Array], steps: list[_Step], marginals: Sequence[Array]) -> tuple[int, ...]:
+    """Viterbi's path among those that are there just where that is more likely than not.
+
+    Poses that differ little share what speaks for them, and the one state of being gone shares with nobody: over all
+    paths the best could be gone where hardly any is.
+    """
+    allowed = [_likelier(marginal) for marginal in marginals]
+    score = start + emissions[0] + allowed[0]
     back: list[NDArray[np.int64]] = []
-    for step, emission in zip(steps, emissions[1:], strict=True):
+    for step, emission, here in zip(steps, emissions[1:], allowed[1:], strict=True):
         joint = score[:, None] + step.log_total
         back.append(np.argmax(joint, axis=0))
-        score = joint.max(axis=0) + emission
+        score = joint.max(axis=0) + emission + here
     path = [int(np.argmax(score))]
     for pointers in reversed(back):
         path.insert(0, int(pointers[path[0]]))
     return tuple(path)
+
+
+def _likelier(marginal: Array) -> Array:
+    """(n + 2,) 0 for the states of the likelier of there and gone, -inf for the others."""
+    gone = marginal[-1] > 0.5
+    return np.append(np.full(len(marginal) - 1, -np.inf if gone else 0.0), 0.0 if gone else -np.inf)

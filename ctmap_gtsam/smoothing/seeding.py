@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.estimate import EXISTS, Estimate
 from ctmap_gtsam.frontend.proposer import distinct
 from ctmap_gtsam.model import Model
 
@@ -30,11 +30,11 @@ class Seed:
 
     object_id: int
     poses: Mapping[int, Array]
-    """class index -> (n, 4, 4) T_world_centre that it ever was believed to have, those believed late first"""
+    """class index -> (n, 4, 4) T_world_centre that it ever was believed to have"""
+    believed: Mapping[int, Mapping[int, Array]]
+    """class index -> keyframe -> (m, 4, 4) T_world_centre believed then, the heaviest first"""
     class_probability: Array
     """(C,) at the end"""
-    best: Mapping[int, Array]
-    """keyframe -> (4, 4) T_world_centre, of the class that is the most probable at the end"""
 
     @property
     def best_class(self) -> int:
@@ -42,10 +42,18 @@ class Seed:
         return max(self.poses, key=lambda c: (self.class_probability[c], -c))
 
     def expected(self, keyframe: int) -> Array:
-        """(4, 4) T_world_centre at a keyframe: what was believed there, or next to it, the past first."""
-        keyframes = sorted(self.best)
+        """(4, 4) T_world_centre of the best class at a keyframe."""
+        return self._then(self.best_class, keyframe)[0]
+
+    def starts(self, keyframe: int) -> dict[int, Array]:
+        """Class index -> (n, 4, 4) T_world_centre to try at a keyframe: all, and what was believed then."""
+        return {c: np.concatenate([poses, self._then(c, keyframe)]) for c, poses in self.poses.items()}
+
+    def _then(self, c: int, keyframe: int) -> Array:
+        """What was believed of a class at a keyframe, or next to it, the past first."""
+        keyframes = sorted(self.believed[c])
         before = [k for k in keyframes if k <= keyframe]
-        return self.best[before[-1] if before else keyframes[0]]
+        return self.believed[c][before[-1] if before else keyframes[0]]
 
 
 def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
@@ -62,17 +70,15 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
 def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
     modes = forward.modes
     own = np.flatnonzero(modes.object == row)
-    # later ones know more; of one keyframe the heavier first
-    own = own[np.lexsort((-modes.log_weight[own], -modes.keyframe[own]))]
-    poses, heaviest = {}, {}
+    # what is believed of a thing that is gone says little of where it was; of the rest the later knows more
+    gone = forward.existence[row, modes.keyframe[own]] <= EXISTS
+    own = own[np.lexsort((-modes.log_weight[own], -modes.keyframe[own], gone))]
+    poses, believed = {}, {}
     for class_id in np.unique(modes.class_id[own]):
         shape = model.shapes[model.catalogue.index(int(class_id))]
         rows = own[modes.class_id[own] == class_id]
         T = shape.to_centre(modes.T_world_object[rows])
         poses[shape.index] = T[distinct(shape, T, -np.arange(len(rows), dtype=float), _ONE_POSE, _KEPT)]
-        # the first of each keyframe is its heaviest
-        first = np.unique(-modes.keyframe[rows], return_index=True)[1]
-        heaviest[shape.index] = {int(modes.keyframe[rows[j]]): T[j] for j in first}
-    probability = forward.class_probability[row, -1]
-    best = max(poses, key=lambda c: (probability[c], -c))
-    return Seed(object_id, poses, probability, heaviest[best])
+        then = modes.keyframe[rows]
+        believed[shape.index] = {int(k): T[then == k] for k in np.unique(then)}
+    return Seed(object_id, poses, believed, forward.class_probability[row, -1])

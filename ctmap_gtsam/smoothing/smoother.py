@@ -104,7 +104,7 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
 
     def wanted(i: int, k: int) -> Wanted:
         likely = frozenset(c for c in seeds[i].poses if seeds[i].class_probability[c] > _LIKELY)
-        return Wanted(seeds[i].poses, (seeds[i].best_class, seeds[i].expected(k)), likely | {seeds[i].best_class})
+        return Wanted(seeds[i].starts(k), (seeds[i].best_class, seeds[i].expected(k)), likely | {seeds[i].best_class})
 
     boxes = associate(recording, model, seeds, expected)
     sightings = gather(recording, proposer, wanted, boxes, lambda _i, _k: (), progress, "round 1")
