@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from factors import context, measurement, mixture
 from factors.symmetry import NONE, Symmetry, gauge_residual, reduced_residual_jacobians, residual_jacobians
+from sequences import se3
 
 Array = NDArray[np.float64]
 Linearised = tuple[Array, tuple[Array, ...]]
@@ -88,6 +89,9 @@ class Predictions:
     sigma: Array
     """(..., 6, 6) from `prediction.covariance`"""
     symmetry: Symmetry = NONE
+    T_reference: Array | None = None
+    """(..., 4, 4) near the pose before: that pose is turned about its free axes to be nearest to it. The residual turns
+    with those axes otherwise, its energy doesn't; Gauss-Newton then takes a free turn for a stiff one"""
 
     @cached_property
     def information(self) -> Array:
@@ -107,13 +111,19 @@ class Predictions:
 
     def linearised(self, values: Sequence[Array]) -> Linearised:
         """See `Terms`."""
-        r, J_a, J_b = reduced_residual_jacobians(values[0], values[1], self.symmetry, self.information)
+        before, after = values
+        turned: Array | None = None
+        if self.T_reference is not None:
+            s, _, J = residual_jacobians(self.T_reference, before, self.symmetry)
+            before, turned = se3.retract(self.T_reference, s), se3.right_jacobian(s) @ J
+        r, J_a, J_b = reduced_residual_jacobians(before, after, self.symmetry, self.information)
         R = self.whitener
-        return (R @ r[..., None])[..., 0], (R @ J_a, R @ J_b)
+        return (R @ r[..., None])[..., 0], (R @ (J_a if turned is None else J_a @ turned), R @ J_b)
 
     def __getitem__(self, index: int) -> Predictions:
         """See `Terms`."""
-        return replace(self, sigma=self.sigma[index])
+        reference = None if self.T_reference is None else self.T_reference[index]
+        return replace(self, sigma=self.sigma[index], T_reference=reference)
 
 
 @dataclass(frozen=True, eq=False)

@@ -366,7 +366,9 @@ def _add_predictions(
     sigma = np.stack([model.prediction_covariance(t) for t in dt])
     if S.free or S.order > 1:
         pairs = np.stack([keys[[i - 1, i]] for i in stays])
-        built.add_batch(Batch("prediction", tuple(names[i] for i in stays), pairs, Predictions(sigma, S)))
+        start = np.stack([built.initial.atPose3(key).matrix() for key in pairs[:, 0].tolist()])
+        terms = Predictions(sigma, S, start if S.free else None)
+        built.add_batch(Batch("prediction", tuple(names[i] for i in stays), pairs, terms))
         return
     for i, covariance in zip(stays, sigma, strict=True):
         built.add("prediction", names[i], stay_factor(int(keys[i - 1]), int(keys[i]), covariance))

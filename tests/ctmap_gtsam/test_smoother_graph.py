@@ -321,3 +321,31 @@ def test_a_number_that_is_none_is_an_error_that_names_its_factor():
     built = build(MODEL, problem.cameras(), problem.noise, {3: (MUG, [*modes[:2], broken, *modes[3:]])})
     with pytest.raises(FactorValueError, match=f"object 3 keyframe {modes[2].keyframe}"):
         built.problem().linearize(built.initial)
+
+
+@pytest.mark.parametrize("name", ["axis", "cylinder"])
+def test_how_wide_the_gauge_is_says_nothing_of_what_isnt_free(name):
+    """And a free turn doesn't keep the solver from its optimum."""
+    symmetry = replace(SYMMETRIES[name], offsets=0 * SYMMETRIES[name].offsets)
+    discrete = symmetry.discrete.copy()
+    discrete[:, :3, 3] = 0.0
+    symmetry = replace(symmetry, discrete=discrete)
+    shape, cameras, modes, _, _ = tangled(4, symmetry)
+    model = Model(classes("mug"), config_of(), context=False)
+    objects = {0: (shape, modes)}
+    answers = []
+    for sigma in (np.pi, 0.05):
+        built = build(model, cameras, LocalisationNoise(0.003, 0.004, 2.0), objects)
+        built._batches = [
+            replace(batch, terms=replace(batch.terms, sigma_rad=sigma)) if batch.kind == "gauge" else batch
+            for batch in built.batches
+        ]
+        answers.append(smooth(built, model, objects, len(cameras)))
+    assert [a.solution.end for a in answers] == ["converged"] * 2
+    assert max(len(a.solution.trace) for a in answers) < 8
+    P = symmetry.projection
+    for k in range(len(cameras)):
+        (T, covariance), (other, narrow) = (a.objects[0][k] for a in answers)
+        np.testing.assert_allclose(P @ residual(T, other, symmetry), 0.0, atol=1e-6)
+        expected = symmetry.reduced_covariance(covariance)
+        np.testing.assert_allclose(symmetry.reduced_covariance(narrow), expected, atol=1e-3 * np.diag(expected).max())

@@ -45,8 +45,34 @@ def test_modes_predictions_and_gauges(symmetry, seed):
     assert_one_by_one(Modes(modes, information, symmetry), [cameras, placed])
     sigma = prediction.covariance(0.2, 0.1, rng.uniform(0.1, 3.0, N), symmetry)
     assert_one_by_one(Predictions(sigma, symmetry), [placed, near(rng, placed)])
+    assert_one_by_one(Predictions(sigma, symmetry, near(rng, placed)), [placed, near(rng, placed)])
     if symmetry.free:
         assert_one_by_one(Gauges(placed, symmetry), [near(rng, placed)])
+
+
+@each_symmetry
+@given(SEEDS)
+@settings(max_examples=5)
+def test_a_prediction_with_a_reference_has_the_same_energy_and_doesnt_turn_with_free_axes(symmetry, seed):
+    rng = np.random.default_rng(seed)
+    reference = random_pose(rng)
+    before = se3.retract(reference, 0.3 * rng.uniform(-1, 1, 6))
+    after = se3.retract(before, 0.3 * rng.uniform(-1, 1, 6))
+    sigma = prediction.covariance(0.2, 0.1, 0.7, symmetry)
+    plain, terms = Predictions(sigma, symmetry), Predictions(sigma, symmetry, reference)
+    r, jacobians = terms.linearised([before, after])
+    assert (r**2).sum() == pytest.approx((plain.linearised([before, after])[0] ** 2).sum(), rel=1e-9)
+    for image in (random_image(rng, symmetry), random_image(rng, symmetry)):
+        np.testing.assert_allclose(terms.linearised([before @ image, after])[0], r, atol=1e-9)
+    for j in range(2):
+        np.testing.assert_allclose(jacobians[j] @ symmetry.generators, 0.0, atol=1e-8)
+
+        def alone(T, j=j):
+            values = [T if i == j else np.broadcast_to(value, T.shape) for i, value in enumerate((before, after))]
+            return terms.linearised(values)[0]
+
+        numerical = numerical_jacobian(alone, (before, after)[j])
+        np.testing.assert_allclose(jacobians[j], numerical, atol=1e-5 * max(1.0, np.abs(numerical).max()))
 
 
 @given(SEEDS)
