@@ -250,7 +250,9 @@ def test_a_thing_is_carried_back_to_the_first_frame_and_its_class_is_the_last_on
     filtered, smoothed = both
     assert (filtered.existence[:, 0] == 0.0).all()
     assert smoothed.exists.all()
-    np.testing.assert_allclose(smoothed.class_probability, filtered.class_probability[:, -1:].repeat(6, axis=1))
+    last = filtered.class_probability[:, -1:].repeat(6, axis=1)
+    # but for the little chance that it is not there in the end, and was of another class
+    np.testing.assert_allclose(smoothed.class_probability, last, atol=0.01)
     for before, after in pairwise(range(6)):
         step = smoothed.pose[:, after, :3, 3] - smoothed.pose[:, before, :3, 3]
         assert np.linalg.norm(step, axis=-1).max() < 0.006
