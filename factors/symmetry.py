@@ -232,9 +232,11 @@ def gauge_residual(T_reference: ArrayLike, T: ArrayLike, symmetry: Symmetry) -> 
 def _pairs(T_a: ArrayLike, T_b: ArrayLike) -> tuple[Array, Array]:
     A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
     if A.shape != B.shape:
-        shape = np.broadcast_shapes(A.shape, B.shape)
         # copies: a broadcast view has another type for a compiled kernel, or warns
-        A, B = (np.array(np.broadcast_to(T, shape), order="C") for T in (A, B))
+        shape = np.broadcast(A, B).shape
+        filled = np.empty((2, *shape))
+        filled[0], filled[1] = A, B
+        A, B = filled[0], filled[1]
     return np.ascontiguousarray(A), np.ascontiguousarray(B)
 
 

@@ -164,6 +164,49 @@ def highlight(
     _figures("highlight", json_file, config_file, assignments, seed, out=writable(out))
 
 
+Quick = Annotated[bool, typer.Option("--quick", help="Few objects and keyframes, to try it out.")]
+
+
+@bench_app.command(name="filter")
+def filter_(
+    quick: Quick = False,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """The filter's keyframes a second against objects, particles and the length of the run, and its memory (synthetic).
+
+    A camera goes round a table, 640 x 480; 5 to 40 things are in view all the time. The whole takes most of an hour.
+
+    Example: `ctmap bench filter --quick --json filter.json`
+    """
+    _figures("filter", json_file, config_file, assignments, seed, sizes=_sizes(quick))
+
+
+@bench_app.command()
+def smooth(
+    quick: Quick = False,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """The smoother's time beside the filter's, against objects and the length of the run, and its memory (synthetic).
+
+    The runs are those of `ctmap bench filter`.
+
+    Example: `ctmap bench smooth --quick --json smooth.json`
+    """
+    _figures("smooth", json_file, config_file, assignments, seed, sizes=_sizes(quick))
+
+
+def _sizes(quick: bool) -> Any:
+    from ctmap_gtsam.bench.scaling.sizes import FULL, QUICK
+
+    return QUICK if quick else FULL
+
+
 def _figures(
     name: str,
     json_file: Path | None,

@@ -16,6 +16,7 @@ from ctmap_gtsam.filtering.particles import (
     Particles,
     Spread,
     Transition,
+    filled,
     modes_of,
     predict,
     predicted_log_density,
@@ -199,14 +200,17 @@ class Updater:
         view = self._first_view(track, observation, around)
         n = len(self.model.shapes)
         score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
-        count = max(self.model.config.filter.particles // n, self.model.config.filter.min_particles)
         best = np.array([m.log_likelihood.max(initial=-np.inf) for m in found]) + self.model.class_evidence(score_sum)
-        classes = []
+        counts, classes = self._counts(best), []
         for shape, modes in zip(self.model.shapes, found, strict=True):
             rng = self._rng("filter.start", track.track_id, observation, shape)
             likely = best[shape.index] > best.max() - 2.0 * _LIKELY
             modes = self.proposer.modes(shape, view, modes.T_camera_centre, probe=likely)
-            classes.append(self._weigh(None, self._in_world(modes, observation), shape, view, observation, count, rng))
+            classes.append(
+                self._weigh(
+                    None, self._in_world(modes, observation), shape, view, observation, int(counts[shape.index]), rng
+                )
+            )
         fresh = Belief(
             object_id=track.track_id,
             classes=tuple(classes),
@@ -507,18 +511,22 @@ class Updater:
         share = 1.0 if own is None else settings.proposal_share if proposals is not None else 0.0
         n_proposed = round(share * count)
         drawn = []
+        prior = None
         if own is not None and spread is not None:
-            drawn.append(predict(own.particles, count - n_proposed, spread, shape, rng))
+            # what is hardly possible isn't worth it
+            sure = count > settings.min_particles
+            prior = filled(own.particles, spread, shape, rng) if sure else own.particles
+            drawn.append(predict(prior, count - n_proposed, spread, shape, rng))
         if proposals is not None:
             drawn.append(proposals.draw(n_proposed, shape, rng))
         T = np.concatenate(drawn)
         score, scores = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
         log_prior = log_drawn = np.full(len(T), log_uniform)
         transition = None
-        if own is not None and spread is not None:
+        if own is not None and prior is not None and spread is not None:
             # nobody pushes a cupboard; if it seems to be elsewhere it was never found, which a search can mend
             jump = self.model.config.prediction.jump_probability if shape.source.movable else 0.0
-            stayed = np.log1p(-jump) + predicted_log_density(own.particles, T, spread, shape)
+            stayed = np.log1p(-jump) + predicted_log_density(prior, T, spread, shape)
             log_drawn = np.logaddexp(stayed, np.log(jump) + log_uniform) if jump > 0.0 else stayed
             # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
             seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)

@@ -14,8 +14,11 @@ the distance between two centres: exact to second order, and a matrix product fo
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
@@ -29,6 +32,17 @@ Array = NDArray[np.float64]
 
 MODE_RADIUS = (0.3, 0.02)
 """rad, metres: particles so near to the heaviest make up its mode"""
+
+_RADII = np.repeat(MODE_RADIUS, 3)
+_EDGE = 3.0  # standard deviations within which particles belong to a mode that spreads over its radius
+_GROWTHS = 8  # of a mode, at most
+_MEANS = 4  # fixed-point steps for a mean; poses of one mode need fewer than five
+_STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
+_MODES = 4  # of one class, at most
+_SPARSE = 2.0  # a kernel so much wider than the prediction closes gaps that the prediction would leave
+_DIMENSIONS = 6
+_NOTHING = 40.0  # nats: what is so far behind the largest adds nothing to a sum in float64
+_SUPPORT = 4  # times as many points hold a belief whose gaps were filled: they cost a prior, not a likelihood
 
 
 @dataclass(frozen=True)
@@ -114,29 +128,53 @@ def predict(particles: Particles, n: int, spread: Spread, shape: Shape, rng: np.
 
 def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape: Shape) -> Array:
     """log sum_k w_k phi_p(x | x_k) (K,) at poses (K, 4, 4), over poses modulo the object's symmetries."""
-    squared, constant = _squared_steps(particles.T_world_centre, T, spread, shape)
-    exponent = (particles.log_weight - 0.5 * squared).reshape(len(T), -1)
-    return logsumexp(exponent, axis=-1) - constant
+    before, after, constant = _steps(particles.T_world_centre, T, spread, shape)
+    out = np.empty(len(T))
+    _log_sums(before, after, particles.log_weight, shape.symmetry.order, out)
+    return out - constant
 
 
 def transition_log_density(T_before: Array, T: Array, spread: Spread, shape: Shape) -> Array:
     """log phi_p(x | x_k) (K, M) of poses (K, 4, 4) given each pose before (M, 4, 4), modulo the object's symmetries."""
-    squared, constant = _squared_steps(T_before, T, spread, shape)
+    before, after, constant = _steps(T_before, T, spread, shape)
+    squared = np.maximum((after**2).sum(-1)[:, None] + (before**2).sum(-1) - 2.0 * after @ before.T, 0.0)
     exponent = -0.5 * squared.reshape(len(T), -1, len(T_before))
     return (exponent[:, 0] if shape.symmetry.order == 1 else logsumexp(exponent, axis=1)) - constant
 
 
-def _squared_steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Array, float]:
-    """-2 times the exponents of phi_p for every image of every pose (K S, M), and the log of its normaliser."""
+def _steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Array, Array, float]:
+    """Features of the poses before (M, D) and of all images of poses (K S, D), and the log of phi_p's normaliser."""
     S = shape.symmetry
     # a pose and its predecessor may be written in different equivalent poses: sum over all of them
     images = (T[:, None] @ S.discrete).reshape(-1, 4, 4)
-    a, b = _features(T_before, shape, spread), _features(images, shape, spread)
-    squared = np.maximum((b**2).sum(-1)[:, None] + (a**2).sum(-1) - 2.0 * b @ a.T, 0.0)
     turns = 3 - S.free
     constant = turns * (np.log(spread.rotation_rad) + 0.5 * LOG_2PI)
     constant += 3 * (np.log(spread.translation_m) + 0.5 * LOG_2PI)
-    return squared, float(constant)
+    return _features(T_before, shape, spread), _features(images, shape, spread), float(constant)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _log_sums(a, b, log_weight, images, out):
+    """log of the sum over rows k of a (M, D) and over each query's images of exp(log_weight_k - |b - a_k|^2 / 2).
+
+    `b` is (K images, D), the images of a query next to each other; `out` is (K,).
+    """
+    exponents = np.empty(images * len(a))
+    for query in range(len(out)):
+        largest, n = -np.inf, 0
+        for image in range(query * images, (query + 1) * images):
+            for k in range(len(a)):
+                squared = 0.0
+                for d in range(a.shape[1]):
+                    squared += (b[image, d] - a[k, d]) ** 2
+                exponents[n] = log_weight[k] - 0.5 * squared
+                largest = max(largest, exponents[n])
+                n += 1
+        total = 0.0
+        for i in range(n):
+            if exponents[i] > largest - _NOTHING:
+                total += math.exp(exponents[i] - largest)
+        out[query] = largest + math.log(total) if total > 0.0 else -np.inf
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
@@ -163,29 +201,121 @@ def _spin(T: Array, shape: Shape, rng: np.random.Generator) -> Array:
     return T @ se3.make(se3.so3_exp(angle * shape.symmetry.axes[0]), np.zeros(3))
 
 
+def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Generator) -> Particles:
+    """The same belief with what lies between its particles: equally weighted poses, drawn from a kernel density.
+
+    What no view tells apart is believed to be anywhere along a line of poses, and few weighted particles on it leave
+    gaps that a prediction of a fraction of a degree doesn't close: at the next keyframe the gaps are impossible, and
+    after some keyframes the belief is a point of its own making. So where a mode's particles are sparse beside the
+    prediction, new ones are drawn by a Gaussian kernel of the mode's own covariance, whose means are drawn in so that
+    mean and covariance stay what they are (West, J. R. Statist. Soc. B 1993; Liu and West, 2001; the regularised
+    particle filter of Musso, Oudjane and Le Gland, 2001). Modes that aren't sparse are left alone.
+
+    Args:
+        particles: weighted.
+        spread: of the prediction that follows.
+        shape: their class.
+        rng: draws them.
+    """
+    walk = np.repeat([spread.rotation_rad, spread.translation_m], 3)
+    sparse = []
+    for mode in _modes(particles, shape, _MODES):
+        share = np.exp(particles.log_weight[mode.rows])
+        effective = float(share.sum() ** 2 / (share**2).sum())
+        width = (effective * (_DIMENSIONS + 2) / 4.0) ** (-1.0 / (_DIMENSIONS + 4))
+        variances, axes = np.linalg.eigh(mode.covariance / np.outer(walk, walk))
+        deviations = np.sqrt(np.maximum(variances, 0.0))
+        if width * deviations[-1] > _SPARSE:
+            sparse.append((mode, np.where(width * deviations > _SPARSE, width, 0.0), deviations, axes))
+    if not sparse:
+        return particles
+    n = _SUPPORT * len(particles.log_weight)
+    picks = systematic(particles.log_weight, n, float(rng.random()))
+    T, normals = particles.T_world_centre[picks], rng.normal(size=(n, 6))
+    for mode, widths, deviations, axes in sparse:
+        own = mode.rows[picks]
+        images = symmetry.nearest_image(mode.T_world_centre, T[own], shape.symmetry)
+        along = (se3.local(mode.T_world_centre, images) / walk) @ axes
+        along = np.sqrt(1.0 - widths**2) * along + widths * deviations * normals[own]
+        T[own] = se3.retract(mode.T_world_centre, (along @ axes.T) * walk)
+    return Particles(T, np.full(n, -np.log(n)))
+
+
+@dataclass(frozen=True)
+class _Mode:
+    """Particles that belong together."""
+
+    rows: NDArray[np.bool_]
+    """(M,) which"""
+    T_world_centre: Array
+    """(4, 4) their mean"""
+    covariance: Array
+    """(6, 6) of its right tangent"""
+
+
+def _modes(particles: Particles, shape: Shape, most: int) -> Iterator[_Mode]:
+    """The mode of the heaviest particle, then of the heaviest one left, as long as they weigh anything.
+
+    A mode is what lies within `MODE_RADIUS` of its heaviest particle. It grows along directions in which its particles
+    spread that far: where nothing tells poses apart they are one mode, however far it reaches.
+    """
+    left, poses, S = particles.log_weight.copy(), particles.T_world_centre, shape.symmetry
+    for _ in range(most):
+        heaviest = int(np.argmax(left))
+        if left[heaviest] < np.log(1e-3):
+            return
+        free = np.isfinite(left)
+        r = symmetry.residual(poses[heaviest], poses, S)
+        rows = free & (np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0])
+        rows &= np.linalg.norm(r[:, 3:], axis=-1) < MODE_RADIUS[1]
+        rows[heaviest] = True
+        T, covariance = _moments(poses[heaviest], poses[rows], left[rows], S)
+        for _ in range(_GROWTHS):
+            variances, axes = np.linalg.eigh(covariance / np.outer(_RADII, _RADII))
+            if variances[-1] <= _EDGE**-2:
+                break
+            r = symmetry.residual(T, poses, S) / _RADII
+            within = ((r @ axes) ** 2 / np.maximum(variances, _EDGE**-2)).sum(axis=-1) < _EDGE**2
+            grown = rows | (free & within)
+            if grown.sum() == rows.sum():
+                break
+            rows = grown
+            T, covariance = _moments(T, poses[rows], left[rows], S)
+        yield _Mode(rows, T, covariance)
+        left[rows] = -np.inf
+
+
+def _moments(T: Array, poses: Array, log_weight: Array, S: symmetry.Symmetry) -> tuple[Array, Array]:
+    """Mean (4, 4) and covariance (6, 6) of weighted poses (n, 4, 4), each taken in its image nearest to the mean.
+
+    Args:
+        T: (4, 4) where the mean is looked for.
+        poses: (n, 4, 4).
+        log_weight: (n,) of any scale.
+        S: the symmetries.
+    """
+    weights = np.exp(mixture.normalised(log_weight))
+    r = symmetry.residual(T, poses, S)
+    for _ in range(_MEANS):
+        step = weights @ r
+        T = se3.retract(T, step)
+        r = symmetry.residual(T, poses, S)
+        if np.abs(step).max() < _STILL:
+            break
+    return T, (weights[:, None] * r).T @ r
+
+
 def modes_of(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:
-    """The heaviest particle's mode, moments matched, and the next one apart from it, if it weighs anything.
+    """The modes of a set, moments matched, the one of the heaviest particle first.
 
     Returns:
         class index `c`, log weight, T_world_centre (4, 4), covariance (6, 6) and free axes (6, f) of each.
     """
     out: list[tuple[int, float, Array, Array, Array]] = []
-    left = particles.log_weight.copy()
-    for _ in range(2):
-        heaviest = int(np.argmax(left))
-        if left[heaviest] < np.log(1e-3):
-            break
-        images = symmetry.nearest_image(particles.T_world_centre[heaviest], particles.T_world_centre, shape.symmetry)
-        r = se3.local(particles.T_world_centre[heaviest], images)
-        near = (np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0]) & (
-            np.linalg.norm(r[:, 3:], axis=-1) < MODE_RADIUS[1]
-        )
-        near &= np.isfinite(left)
-        near[heaviest] = True
-        T, covariance = mixture.moment_match(images[near], None, left[near], iterations=4)
-        free = shape.symmetry.free_axes
+    free = shape.symmetry.free_axes
+    for mode in _modes(particles, shape, _MODES):
         # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
-        covariance = covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
-        out.append((c, float(mixture.log_sum(left[near])), T, covariance, free))
-        left[near] = -np.inf
+        covariance = mode.covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
+        weight = float(mixture.log_sum(particles.log_weight[mode.rows]))
+        out.append((c, weight, mode.T_world_centre, covariance, free))
     return out

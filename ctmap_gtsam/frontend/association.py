@@ -10,6 +10,7 @@ prediction is also met where the detector calls it the same and it lies within h
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,7 +44,8 @@ class Track:
 
     def at(self, keyframe: int) -> Detection | None:
         """Its detection at a keyframe, if any."""
-        return self.detections[self.keyframes.index(keyframe)] if keyframe in self.keyframes else None
+        i = bisect_left(self.keyframes, keyframe)
+        return self.detections[i] if i < len(self.keyframes) and self.keyframes[i] == keyframe else None
 
 
 @dataclass
@@ -69,6 +71,8 @@ class Associator:
         self._settings = settings
         self._reach_m = np.array([0.5 * c.diameter_m for c in catalogue.classes])
         self._tracks: list[_Open] = []
+        self._live: list[int] = []
+        """tracks that a box may join: all but those given up, of which a long run has more and more"""
 
     def step(self, observation: Observation) -> None:
         """Take in the next keyframe."""
@@ -94,26 +98,26 @@ class Associator:
 
     def _match(self, frame: Frame, detections: list[Detection], points: list[Array]) -> dict[int, int]:
         """Hungarian assignment by overlap with the predicted boxes, else by place: track -> detection."""
-        if not detections or not self._tracks:
+        if not detections or not self._live:
             return {}
-        predicted = np.stack([_predicted_box(t, frame) for t in self._tracks])
+        live = [self._tracks[i] for i in self._live]
+        predicted = np.stack([_predicted_box(t, frame) for t in live])
         boxes = np.array([d.box for d in detections])
         overlap = box_iou(predicted[:, None], boxes[None])
         # what is too small counts nothing, or two that are too small could outweigh one that is not
         least = self._settings.association_iou
-        affinity = np.where(overlap >= least, overlap, least * self._nearness(detections, points))
+        affinity = np.where(overlap >= least, overlap, least * self._nearness(live, detections, points))
         rows, columns = linear_sum_assignment(-affinity)
-        return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if affinity[r, c] > 0.0}
+        return {self._live[r]: int(c) for r, c in zip(rows, columns, strict=True) if affinity[r, c] > 0.0}
 
-    def _nearness(self, detections: list[Detection], points: list[Array]) -> Array:
+    def _nearness(self, tracks: list[_Open], detections: list[Detection], points: list[Array]) -> Array:
         """(tracks, detections) from 1, in one place and called the same, to 0, further apart than its size allows."""
-        believed = np.stack([t.score_sum / t.score_sum.sum() for t in self._tracks])
+        believed = np.stack([t.score_sum / t.score_sum.sum() for t in tracks])
         called = np.stack([_class_shares(d) for d in detections])
         same = believed @ called.T
-        apart = np.linalg.norm(np.stack([t.point_world for t in self._tracks])[:, None] - np.stack(points), axis=-1)
+        apart = np.linalg.norm(np.stack([t.point_world for t in tracks])[:, None] - np.stack(points), axis=-1)
         near = np.maximum(1.0 - apart / self._reach_m[np.argmax(believed, axis=1)][:, None], 0.0)
-        given_up = np.array([np.isnan(t.box).any() for t in self._tracks])
-        return np.where((same >= _SAME_CLASS) & ~given_up[:, None], same * near, 0.0)
+        return np.where(same >= _SAME_CLASS, same * near, 0.0)
 
     def _extend(self, track: _Open, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None
@@ -129,17 +133,21 @@ class Associator:
 
     def _age(self, frame: Frame, matched: set[int]) -> None:
         """Tracks that were not met: one that has not started must be consistent, and is given up when it was not."""
-        for i, track in enumerate(self._tracks):
+        lost = set()
+        for i in self._live:
+            track = self._tracks[i]
             if i in matched or track.started is not None:
                 continue
             track.streak = 0
             if frame.time_ns - track.last_ns > self._settings.lost_after_s * 1e9:
-                track.box = np.full(4, np.nan)
+                lost.add(i)
+        self._live = [i for i in self._live if i not in lost]
 
     def _open(self, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None
         nothing = np.zeros(len(self._reach_m))
         track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, 0, nothing)
+        self._live.append(len(self._tracks))
         self._tracks.append(track)
         self._extend(track, observation, detection, point)
 
@@ -153,7 +161,7 @@ def _class_shares(detection: Detection) -> Array:
 def _predicted_box(track: _Open, frame: Frame) -> Array:
     """The track's last box (x, y, w, h) carried to another camera: centre projected, size scaled by depth, clipped."""
     centre = se3.transform(frame.T_camera_world, track.point_world[None])[0]
-    if centre[2] <= 0.0 or np.isnan(track.box).any():
+    if centre[2] <= 0.0:
         return np.zeros(4)
     size = track.box[2:] * track.z / centre[2]
     low = frame.camera.project(centre) - size / 2

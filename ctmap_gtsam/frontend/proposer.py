@@ -42,6 +42,7 @@ _UNLIKE = 0.4  # sizes of which one is less than this share of the other don't b
 _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for one that is large
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
+_RIPPLE = 2.0  # a width so many times that of the score's first fall is the score's, the first fall a ripple
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -337,7 +338,7 @@ class Proposer:
         self.hypotheses_scored += len(around)
         here, there = depth[: len(poses)], depth[len(poses) :].reshape(len(poses), 6, -1)
         drop = view.share * self.model.kappa * (here[:, None, None] - there)
-        sigma = _widths(drop.reshape(len(poses), 6, 2, -1).mean(axis=2))
+        sigma = _widths(drop.reshape(len(poses), 6, 2, -1))
         scaled = directions * unit
         return np.asarray(np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled))
 
@@ -392,11 +393,12 @@ def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float
         most: so many rows at most.
     """
     kept: list[int] = []
-    for row in np.argsort(-score, kind="stable"):
-        if len(kept) == most:
-            break
-        if not kept or not near(poses[kept], poses[row], shape.symmetry, *apart).any():
-            kept.append(int(row))
+    left = np.argsort(-score, kind="stable")
+    while len(left) and len(kept) < most:
+        row, left = int(left[0]), left[1:]
+        kept.append(row)
+        if len(left):
+            left = left[~near(poses[row], poses[left], shape.symmetry, *apart)]
     return kept
 
 
@@ -436,16 +438,23 @@ def _centre_region(box: Array, image_size: tuple[int, int], nearness: float) -> 
 
 
 def _widths(drop: Array) -> Array:
-    """Standard deviations (n, 6), scaled metres, from the log-likelihood's fall (n, 6, steps) along each direction.
+    """Standard deviations (n, 6), scaled metres, from the log-likelihood's fall (n, 6, 2, steps), both ways along axes.
 
-    The first step at which it falls by half a nat, one standard deviation of a Gaussian, tells the width by its
-    parabola; the last step is the width where it never does.
+    The first step at which it falls by half a nat on the mean of both ways, one standard deviation of a Gaussian, tells
+    the width by its parabola. Where the score is flat but for ripples, such as facets make, that is a ripple's width:
+    the root mean square step, weighed by the likelihood of where it leads, is then the larger, and is taken.
     """
-    reached = drop >= 0.5
+    both = drop.mean(axis=2)
+    reached = both >= 0.5
     flat = ~reached.any(axis=-1)
     first = np.where(flat, len(_LADDER_M) - 1, np.argmax(reached, axis=-1))
-    fall = np.maximum(np.take_along_axis(drop, first[..., None], axis=-1)[..., 0], 0.5)
-    return np.asarray(_LADDER_M[first] / np.sqrt(2.0 * fall))
+    fall = np.maximum(np.take_along_axis(both, first[..., None], axis=-1)[..., 0], 0.5)
+    parabola = _LADDER_M[first] / np.sqrt(2.0 * fall)
+    steps = np.concatenate([[0.0], _LADDER_M])
+    likelihood = np.exp(-np.maximum(drop, 0.0)).sum(axis=2)
+    likelihood = np.concatenate([np.full((*likelihood.shape[:2], 1), 2.0), likelihood], axis=-1)
+    square = np.trapezoid(likelihood * steps**2, steps) / np.trapezoid(likelihood, steps)
+    return np.where(np.sqrt(square) > _RIPPLE * parabola, np.sqrt(square), parabola)
 
 
 def _no_modes() -> PoseModes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,9 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors.context import context_log_ratio, doubted, hinge_log_potential
 from sequences import se3
+from sequences.camera import Camera
 from sequences.geometry import Plane, plane_depth
+from sequences.rendering.kernels import NEAR_M
 from sequences.rendering.scene import render_scene
 from sequences.types import Frame
 
@@ -58,6 +60,8 @@ class Surroundings:
     neighbours: tuple[Neighbour, ...]
     supports: tuple[Plane, ...]
     """level surfaces, world frame; empty where up is unknown"""
+    _surfaces: dict[int, tuple[tuple[Plane, Array], ...]] = field(default_factory=dict, repr=False, compare=False)
+    """frame -> supports in its camera's frame and where in its image: the same for all objects, worked out once"""
 
     def without(self, object_id: int) -> Surroundings:
         """The same for one object: it is not its own neighbour, nor are those that yield to it."""
@@ -67,15 +71,18 @@ class Surroundings:
 
     def beneath(self, tile: Tile, frame: Frame, box: Array) -> Tile:
         """The tile of a thing with a box (x, y, w, h), with known surfaces behind where this image alone shows none."""
-        surfaces = (s.moved(frame.T_camera_world) for s in self.supports)
-        camera = frame.camera
-        others = tuple(s for s in surfaces if reaches_beyond(s, where_in_image(s, camera), box, camera))
+        if frame.index not in self._surfaces:
+            moved = (s.moved(frame.T_camera_world) for s in self.supports)
+            self._surfaces[frame.index] = tuple((s, where_in_image(s, frame.camera)) for s in moved)
+        views = self._surfaces[frame.index]
+        others = tuple(s for s, where in views if reaches_beyond(s, where, box, frame.camera))
         known = plane_depth(others, tile.camera)
         return replace(tile, background=np.where(tile.background > 0, tile.background, known))
 
     def behind(self, tile: Tile, frame: Frame) -> Tile:
         """The tile with the neighbours joined to its background: their pixels are theirs."""
-        items = [(n.shape.mesh, frame.T_camera_world @ n.T_world_centre) for n in self.neighbours]
+        poses = [(n.shape, frame.T_camera_world @ n.T_world_centre) for n in self.neighbours]
+        items = [(shape.mesh, T) for shape, T in poses if _may_show(shape.reach_m, T[:3, 3], tile.camera)]
         if not items:
             return tile
         there = render_scene(items, tile.camera).depth
@@ -107,6 +114,23 @@ class Surroundings:
                 sinking = hinge_log_potential(depth - settings.support_tolerance_m, settings.penetration_sigma_m)
                 total[near] += doubted(sinking, settings.doubt)
         return total
+
+
+def _may_show(reach_m: float, centre: Array, camera: Camera) -> bool:
+    """Whether any of a ball about a point (3,) in the camera frame can be in the image; never wrongly no."""
+    nearest, farthest = centre[2] - reach_m, centre[2] + reach_m
+    if nearest < NEAR_M:
+        return bool(farthest > 0.0)
+    for at, focal, middle, size in (
+        (centre[0], camera.fx, camera.cx, camera.width),
+        (centre[1], camera.fy, camera.cy, camera.height),
+    ):
+        low, high = at - reach_m, at + reach_m
+        left = focal * low / (nearest if low < 0.0 else farthest) + middle
+        right = focal * high / (nearest if high > 0.0 else farthest) + middle
+        if right < -1.0 or left > size:
+            return False
+    return True
 
 
 def penetration_depth(a: Shape, b: Shape, T_a_b: Array) -> Array:

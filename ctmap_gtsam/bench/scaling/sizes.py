@@ -1,0 +1,59 @@
+"""Which runs are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ctmap_gtsam.bench.scaling.loop import ROUND, write_loop
+from sequences.progress import Progress
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers of objects, of particles and of keyframes; a figure each."""
+
+    objects: tuple[int, ...]
+    particles: tuple[int, ...]
+    """tried with the number of objects that is nearest to ten"""
+    lengths: tuple[int, int]
+    """keyframes of the short and of the long run"""
+    length_objects: int
+    """in these two"""
+    keyframes: int
+    """of all other runs"""
+    round_frames: int = ROUND
+
+    @property
+    def middle(self) -> int:
+        """The number of objects that particles are varied with."""
+        return min(self.objects, key=lambda n: (abs(n - 10), n))
+
+
+FULL = Sizes((5, 10, 20, 40), (100, 300, 1000), (100, 2000), 5, 40)
+QUICK = Sizes((2, 5), (100, 300), (30, 120), 2, 15, round_frames=30)
+
+
+@contextmanager
+def loops(objects: Sequence[int], frames: int, seed: int, progress: Progress) -> Iterator[dict[int, Path]]:
+    """A round of each number of objects, in a temporary folder."""
+    with TemporaryDirectory(prefix="ctmap-bench-") as folder:
+        paths = {n: Path(folder) / f"{n}" for n in sorted(set(objects))}
+        for n, path in paths.items():
+            write_loop(path, n, seed, frames, progress)
+        yield paths
+
+
+def by_length(
+    name: str, short: tuple[float, float], long: tuple[float, float], lengths: tuple[int, int]
+) -> dict[str, float]:
+    """Figures of a short and of a long run, each (seconds a keyframe, megabytes), and their ratios."""
+    out: dict[str, float] = {}
+    for n, (seconds, mb) in zip(lengths, (short, long), strict=True):
+        out |= {f"{name}.seconds_per_keyframe_{n}": seconds, f"{name}.peak_mb_{n}": mb}
+    out[f"{name}.seconds_long_over_short"] = long[0] / short[0]
+    out[f"{name}.memory_long_over_short"] = long[1] / short[1]
+    return out
