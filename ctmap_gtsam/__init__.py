@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ctmap_gtsam.estimate import Estimate
     from ctmap_gtsam.evaluation.comparison import compare
     from ctmap_gtsam.filtering.filter import filter_run
+    from ctmap_gtsam.smoothing.lagged import lagged_run
     from ctmap_gtsam.smoothing.smoother import smooth_run
     from sequences.bop import load_run
     from sequences.errors import InputError
@@ -30,6 +31,7 @@ __all__ = [
     "InputError",
     "compare",
     "filter_run",
+    "lagged_run",
     "load_config",
     "load_run",
     "load_truth",
@@ -42,6 +44,7 @@ _HOMES = {
     "InputError": "sequences.errors",
     "compare": "ctmap_gtsam.evaluation.comparison",
     "filter_run": "ctmap_gtsam.filtering.filter",
+    "lagged_run": "ctmap_gtsam.smoothing.lagged",
     "load_config": "ctmap_gtsam.config",
     "load_run": "sequences.bop",
     "load_truth": "sequences.truth",

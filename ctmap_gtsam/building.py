@@ -43,6 +43,14 @@ class Tables:
         self.existence = np.zeros((self.objects, self.keyframes))
         self.in_view = np.zeros((self.objects, self.keyframes), dtype=bool)
 
+    def grow(self) -> int:
+        """Make room for one object more: its row."""
+        one = Tables(1, self.keyframes, self.classes)
+        for name in ("class_probability", "existence", "in_view"):
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(one, name)]))
+        self.objects += 1
+        return self.objects - 1
+
     def mode(
         self, row: int, keyframe: int, class_id: int, log_weight: float, T: Array, covariance: Array, free: Array
     ) -> None:

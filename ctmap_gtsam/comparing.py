@@ -92,6 +92,7 @@ def run_methods(
         methods: names, all of the registry where not given.
         config: their settings.
         store: a folder of estimates; what lies there already, of the same run, settings and code, is taken instead.
+            Methods that work in rounds keep the last one there while they run, to go on from it when they were stopped.
         progress: who listens.
         registry: the methods there are, `ctmap_gtsam.methods.METHODS` where not given.
 
@@ -232,7 +233,8 @@ class _Session:
         assert method.run is not None
         needed = [self.outcome(name) for name in method.needs]
         start, watch = time.perf_counter(), Stopwatch(self.progress)
-        estimate = method.run(self.run, self.config, watch, *(one.estimate for one in needed))
+        kept = {"keep": self.store and self.store / f".{method.name}.rounds.npz"} if method.resumes else {}
+        estimate = method.run(self.run, self.config, watch, *(one.estimate for one in needed), **kept)
         # what it takes alone
         seconds = time.perf_counter() - start + sum(one.seconds or 0.0 for one in needed)
         if stored is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 from ctmap_gtsam.baselines import oracle, registration
@@ -16,6 +17,7 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.backward import backward_run
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.literal import literal_filter_run
+from ctmap_gtsam.smoothing.lagged import lagged_run
 from ctmap_gtsam.smoothing.smoother import Look, smooth_run
 from sequences.progress import Progress
 from sequences.types import Run
@@ -39,6 +41,8 @@ class Method:
     """methods on whose estimates it builds, and which can run wherever it can; `comparing.run_methods` runs them"""
     reads_truth: bool = False
     """it answers from what nobody knows outside a benchmark, and is shown as such"""
+    resumes: bool = False
+    """`run` takes `keep`: a file in which it keeps how far it is, or None"""
 
 
 def _needs_detections(run: Run) -> str | None:
@@ -67,8 +71,19 @@ def _backward(run: Run, config: Config, progress: Progress, *, context: bool) ->
     return backward_run(run, config, context=context, progress=progress)
 
 
-def _smooth(run: Run, config: Config, progress: Progress, forward: Estimate, look: Look | None = None) -> Estimate:
-    return smooth_run(run, forward, config, progress=progress, look=look)
+def _smooth(
+    run: Run,
+    config: Config,
+    progress: Progress,
+    forward: Estimate,
+    look: Look | None = None,
+    keep: Path | None = None,
+) -> Estimate:
+    return smooth_run(run, forward, config, progress=progress, look=look, keep=keep)
+
+
+def _lagged(run: Run, config: Config, progress: Progress, forward: Estimate, *, lag: int | None) -> Estimate:
+    return lagged_run(run, forward, config, lag=lag, progress=progress)
 
 
 METHODS: dict[str, Method] = {
@@ -97,9 +112,13 @@ METHODS: dict[str, Method] = {
                "estimate", partial(_backward, context=True), _needs_detections),
         Method("last-copied-back", "filter-ct's last map of each visit in all of the visit's frames", "estimate",
                copy_back, _needs_detections, needs=("filter-ct",)),
+        Method("lag0-ct", "the smoother with a lag of 0: its factors and trellis, each frame seeing the past",
+               "estimate", partial(_lagged, lag=0), _needs_detections, needs=("filter-ct",)),
+        Method("lag-ct", "the smoother with a fixed lag, each frame seeing `smoother.lag` keyframes more",
+               "estimate", partial(_lagged, lag=None), _needs_detections, needs=("filter-ct",)),
         Method("smooth-t", "the factor-graph smoother without context, from filter-t's objects", "estimate",
-               _smooth, _needs_detections, needs=("filter-t",)),
+               _smooth, _needs_detections, needs=("filter-t",), resumes=True),
         Method("smooth-ct", "the factor-graph smoother from filter-ct's objects, each frame seeing the whole run",
-               "estimate", _smooth, _needs_detections, needs=("filter-ct",)),
+               "estimate", _smooth, _needs_detections, needs=("filter-ct",), resumes=True),
     )
 }  # fmt: skip

@@ -145,6 +145,9 @@ class Smoother:
     rounds: int = option(2, "re-weighting rounds after the first, at most", low=2)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)
+    lag: int = option(5, "fixed lag: keyframe t is estimated from those up to t + lag (method lag-ct)", low=0)
+    window: int = option(10, "fixed lag: keyframes before the lag that are still solved anew", low=1)
+    remembered: int = option(10, "fixed lag: views of an object from before those that are kept, at most", low=2)
 
 
 @dataclass(frozen=True)

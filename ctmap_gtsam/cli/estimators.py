@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,18 @@ if TYPE_CHECKING:
 
 NoContext = Annotated[bool, typer.Option("--no-context", help="Leave the context between objects out.")]
 AsInPaper = Annotated[bool, typer.Option("--paper", help="Algorithm 1 and the potentials to the letter of the paper.")]
+
+
+Lag = Annotated[
+    int | None,
+    typer.Option(
+        "--lag",
+        metavar="L",
+        min=0,
+        help="Estimate keyframe t from those up to t + L.",
+        show_default="the whole run",
+    ),
+]
 
 
 def filter(
@@ -45,6 +58,7 @@ def smooth(
     run: RunFolder,
     out: Out,
     no_context: NoContext = False,
+    lag: Lag = None,
     graph: Annotated[
         Path | None, typer.Option("--graph", metavar="DIR", help="Folder for the factor graph, to look into.")
     ] = None,
@@ -53,7 +67,11 @@ def smooth(
     assignments: Assignments = None,
     seed: Seed = None,
 ) -> None:
-    """Smooth a run: each frame's map knows the whole run. Writes DIR/smooth-ct.npz (smooth-t without context).
+    """Smooth a run: each frame's map knows the whole run, or with --lag the next L keyframes.
+
+    Writes DIR/smooth-ct.npz (smooth-t without context, lag-ct with a lag, lag0-ct with a lag of 0). The whole run
+    is smoothed in rounds after a filter's pass; what is there of them is kept in DIR/.METHOD until the end, and a
+    command that was stopped goes on from it.
 
     With --graph also the last round's factors with their errors (factors.csv), the graph for Graphviz (graph.dot) and
     g2o (graph.g2o), and a picture (graph.png).
@@ -61,6 +79,12 @@ def smooth(
     Example: `ctmap smooth recordings/kitchen --out results --graph results/graph`
     """
     method = "smooth-t" if no_context else "smooth-ct"
+    if lag is not None:
+        for unfit, name in ((no_context, "--no-context"), (graph is not None, "--graph")):
+            if unfit:
+                raise InputError(f"a fixed lag can't be had with {name}", field="--lag", remedy=f"leave {name} out")
+        method = "lag-ct" if lag else "lag0-ct"
+        assignments = [*(assignments or []), f"smoother.lag={lag}"]
     folder = None if graph is None else writable(graph)
     _estimate(method, run, scene, out, settings(config_file, assignments, seed), folder)
 
@@ -121,14 +145,16 @@ def _estimate(
     from ctmap_gtsam.runtime.progress import RichProgress
     from sequences.bop import load_run
 
-    path = writable(out) / f"{method}.npz"
+    path, work = writable(out) / f"{method}.npz", out / f".{method}"
     run = load_run(run_path, scene=scene)
     with RichProgress() as progress:
         registry = None if graph is None else _looking(method, graph)
-        outcome = run_methods(run, [method], config, progress=progress, registry=registry)[method]
+        store = work if graph is None else None  # the graph is of a solution that is not kept
+        outcome = run_methods(run, [method], config, store, progress, registry)[method]
     if outcome.estimate is None:
         raise InputError(f"{method} can't run: {outcome.reason}", file=run_path, remedy=outcome.remedy)
     outcome.estimate.save(path)
+    shutil.rmtree(work, ignore_errors=True)
     show_estimate(outcome.estimate, run.catalogue)
     show_solver(outcome.estimate, config.smoother)
     typer.echo(path)

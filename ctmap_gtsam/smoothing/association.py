@@ -6,7 +6,7 @@ So tracks that change over from one thing to another, break off or start twice a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.modes import Recording
 from factors.measurement import box_iou
-from sequences.types import Detection
+from sequences.types import Detection, Frame
 
 Array = NDArray[np.float64]
 
@@ -53,20 +53,32 @@ def associate(
     ids = sorted(objects)
     out: dict[int, dict[int, Detection]] = {i: {} for i in ids}
     for k, frame_index in enumerate(recording.keyframes):
-        detections = recording.run.frames[int(frame_index)].detections
-        there = [(i, e) for i in ids if (e := expected(i, k)) is not None]
-        if not detections or not there:
-            continue
-        affinity = np.stack([_affinity(recording, model, k, e) for _, e in there])
-        for row, column in zip(*linear_sum_assignment(-affinity), strict=True):
-            if affinity[row, column] > 0.0:
-                out[there[row][0]][k] = detections[column]
+        there = {i: e for i in ids if (e := expected(i, k)) is not None}
+        frame = recording.run.frames[int(frame_index)]
+        for i, detection in assign(frame, recording.box_depths[k], model, there).items():
+            out[i][k] = detection
     return out
 
 
-def _affinity(recording: Recording, model: Model, k: int, expected: Expected) -> Array:
+def assign(frame: Frame, box_depths: Array, model: Model, there: Mapping[int, Expected]) -> dict[int, Detection]:
+    """Object -> its detection in one keyframe.
+
+    Args:
+        frame: the keyframe.
+        box_depths: (D,) in the middle of each detection, metres; 0 where nothing was measured.
+        model: shapes and thresholds.
+        there: object -> what the map says of it, in ascending order.
+    """
+    if not frame.detections or not there:
+        return {}
+    ids = list(there)
+    affinity = np.stack([_affinity(frame, box_depths, model, e) for e in there.values()])
+    pairs = zip(*linear_sum_assignment(-affinity), strict=True)
+    return {ids[row]: frame.detections[column] for row, column in pairs if affinity[row, column] > 0.0}
+
+
+def _affinity(frame: Frame, z: Array, model: Model, expected: Expected) -> Array:
     """(D,) of an object to a keyframe's detections: overlap, by half what both are called and whether it exists."""
-    frame = recording.run.frames[int(recording.keyframes[k])]
     shape = model.shapes[expected.shape]
     T = frame.T_camera_world @ expected.T_world_centre
     seen = outlook(shape, T, frame.camera)
@@ -80,7 +92,6 @@ def _affinity(recording: Recording, model: Model, k: int, expected: Expected) ->
     part = (_inside(boxes, seen.box) >= _WITHIN) & (same >= _CALLED)
     near = np.where(overlap >= least, overlap, np.where(part, least, 0.0))
     # what stands before an object isn't it; what is seen behind may be, past its rim or through its handle
-    z = recording.box_depths[k]
     before = (z > 0.0) & (z < T[2, 3] - shape.reach_m - model.config.sensor.occlusion_margin_m)
     return np.where(before, 0.0, near * (0.5 + 0.5 * same) * (0.5 + 0.5 * expected.existence))
 

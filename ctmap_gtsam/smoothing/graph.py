@@ -88,7 +88,7 @@ class Label:
     """What a factor is."""
 
     kind: str
-    """localisation, bias, measurement, prediction, context, gauge"""
+    """localisation, bias, measurement, prediction, context, gauge, carried"""
     name: str
     keys: tuple[int, ...]
 
@@ -186,12 +186,27 @@ class SmootherGraph:
 
 
 @dataclass(frozen=True)
+class Carried:
+    """What measurements before a window of keyframes say of the variables that it begins with.
+
+    These are the camera of the keyframe before it, each object at its last measurement before it, and the biases.
+    """
+
+    first: int
+    """first keyframe of the window"""
+    factors: Any
+    """gtsam.GaussianFactorGraph"""
+    at: Any
+    """gtsam.Values that the factors are linear about"""
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """The solution in arrays."""
 
     solution: Solution
     T_world_camera: Array
-    """(K, 4, 4)"""
+    """(K, 4, 4); of a window, from its first keyframe on"""
     camera_covariance: Array
     """(K, 6, 6)"""
     objects: Mapping[int, Mapping[int, tuple[Array, Array]]]
@@ -251,29 +266,42 @@ def build(
     cameras: Sequence[Camera],
     noise: LocalisationNoise,
     objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
+    carried: Carried | None = None,
 ) -> SmootherGraph:
-    """The graph of a run.
+    """The graph of a run, or of a window of it.
 
     Args:
         model: potentials.
         cameras: one a keyframe.
         noise: of the recorded poses.
-        objects: object -> its class and chosen modes in order of time.
+        objects: object -> its class and chosen modes in order of time; of those before a window, the last one where its
+            variable is carried, else none.
+        carried: what came before the window; None where it is the whole run. Cameras are given from the first of all.
     """
     built = SmootherGraph()
-    _add_cameras(built, cameras, noise)
+    first = 0
+    if carried is not None:
+        first = carried.first
+        built.initial.insert(carried.at)
+        for i in range(carried.factors.size()):
+            built.add("carried", f"before {first}", gtsam.LinearContainerFactor(carried.factors.at(i), carried.at))
+    _add_cameras(built, cameras, noise, first)
     for row, (shape, measured) in objects.items():
         built.objects[row] = shape.source.name
         _add_object(built, model, row, shape, measured, cameras)
     if model.context:
-        _add_context(built, model, objects)
+        _add_context(built, model, objects, first)
     return built
 
 
 def smooth(
-    built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]], n: int
+    built: SmootherGraph,
+    model: Model,
+    objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
+    n: int,
+    first: int = 0,
 ) -> Smoothed:
-    """Solve and take the marginals; n is the number of keyframes."""
+    """Solve and take the marginals of the keyframes from `first` to n - 1."""
     settings = model.config.smoother
     problem = built.problem()
     solution = optimise(problem, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
@@ -282,20 +310,20 @@ def smooth(
     def read(key: int) -> tuple[Array, Array]:
         return solution.values.atPose3(key).matrix(), marginals.marginalCovariance(key)
 
-    cameras = [read(camera_key(k)) for k in range(n)]
+    cameras = [read(camera_key(k)) for k in range(first, n)]
     poses = {
         row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured} for row, (_, measured) in objects.items()
     }
     return Smoothed(solution, np.stack([c[0] for c in cameras]), np.stack([c[1] for c in cameras]), poses)
 
 
-def _add_cameras(built: SmootherGraph, cameras: Sequence[Camera], noise: LocalisationNoise) -> None:
+def _add_cameras(built: SmootherGraph, cameras: Sequence[Camera], noise: LocalisationNoise, first: int) -> None:
     """Recorded poses with a stationary Gauss-Markov error a visit, e_k+1 = rho e_k + noise."""
     sigmas = np.repeat([noise.rotation_rad, noise.translation_m], 3)
     exact = not (sigmas > 0).all()
     sigmas = np.maximum(sigmas, _EXACT)
     drifting = []
-    for k, camera in enumerate(cameras):
+    for k, camera in enumerate(cameras[first:], start=first):
         pose = gtsam.Pose3(camera.T_world_camera)
         built.initial.insert(camera_key(k), pose)
         if exact or k == 0 or cameras[k - 1].visit != camera.visit:
@@ -326,10 +354,31 @@ def _add_object(
         return
     S = shape.symmetry
     recorded = np.stack([cameras[m.keyframe].T_world_camera for m in measured])
-    # one of the equivalent poses throughout: the bias lives in the object's tangent
-    T = _one_image(recorded @ np.stack([m.T_camera_centre for m in measured]), S)
+    T = recorded @ np.stack([m.T_camera_centre for m in measured])
     keys = np.array([object_key(row, m.keyframe) for m in measured])
     names = tuple(f"object {row} keyframe {m.keyframe}" for m in measured)
+    old = int(built.initial.exists(int(keys[0])))  # the first, where it is carried
+    if old:
+        T[0] = built.initial.atPose3(int(keys[0])).matrix()
+    # one of the equivalent poses throughout: the bias lives in the object's tangent
+    T = _one_image(T, S)
+    if len(measured) > old:
+        new = slice(old, None)
+        _add_measurements(built, model, row, S, measured[new], recorded[new], T[new], keys[new], names[new])
+    _add_predictions(built, model, S, measured, keys, names)
+
+
+def _add_measurements(
+    built: SmootherGraph,
+    model: Model,
+    row: int,
+    S: symmetry.Symmetry,
+    measured: Sequence[Measured],
+    recorded: Array,
+    T: Array,
+    keys: NDArray[np.int64],
+    names: tuple[str, ...],
+) -> None:
     for key, pose in zip(keys.tolist(), T, strict=True):
         built.initial.insert(key, gtsam.Pose3(pose))
     for visit in dict.fromkeys(m.visit for m in measured):
@@ -340,7 +389,6 @@ def _add_object(
     built.add_batch(Batch("measurement", names, np.array(seen_by), modes))
     if S.free:
         built.add_batch(Batch("gauge", names, keys[:, None], Gauges(T, S)))
-    _add_predictions(built, model, S, measured, keys, names)
 
 
 def _one_image(T: Array, S: symmetry.Symmetry) -> Array:
@@ -385,12 +433,15 @@ def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
     built.add("bias", f"object {row} visit {visit}", gtsam.PriorFactorVector(key, np.zeros(6), noise))
 
 
-def _add_context(built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]]) -> None:
+def _add_context(
+    built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]], first: int
+) -> None:
     """Category context of related pairs, one fact spread over the keyframes that they share."""
     pairs = []
     for a, b in combinations(sorted(objects), 2):
         if model.relations[objects[a][0].index, objects[b][0].index].together > 0.0:
-            shared = sorted({m.keyframe for m in objects[a][1]} & {m.keyframe for m in objects[b][1]})
+            both = {m.keyframe for m in objects[a][1]} & {m.keyframe for m in objects[b][1]}
+            shared = sorted(k for k in both if k >= first)
             pairs += [(a, b, k, len(shared)) for k in shared]
     if not pairs:
         return

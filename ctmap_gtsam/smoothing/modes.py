@@ -19,6 +19,7 @@ from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
+from sequences import se3
 from sequences.geometry import Plane
 from sequences.progress import Progress
 from sequences.types import Detection, Run
@@ -59,6 +60,22 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class Look:
+    """Where and beside what one object is looked for in one keyframe: a tile of its depth, not the image."""
+
+    keyframe: int
+    time_s: float
+    T_world_camera: Array
+    """(4, 4) as recorded"""
+    view: View
+    around: Surroundings
+    viewpoint: Array
+    """(3,) from where the object is thought to be to the camera, metres, world frame"""
+    first: bool
+    """whether it is the object's first"""
+
+
+@dataclass(frozen=True)
 class Sighting:
     """One object in one keyframe in whose view it should be."""
 
@@ -92,10 +109,15 @@ def record(run: Run, keyframes: NDArray[np.int64], model: Model, progress: Progr
         for observation in observations(run, keyframes, model.config.seed):
             place.update(observation)
             planes.append(observation.planes)
-            boxes = [np.array(d.box) for d in observation.frame.detections]
-            depths.append(np.array([centre_depth(observation.depth, box) for box in boxes]))
+            depths.append(box_depths(observation))
             stage.advance()
     return Recording(run, keyframes, tuple(planes), tuple(depths), place)
+
+
+def box_depths(observation: Observation) -> Array:
+    """(D,) depths in the middle of a keyframe's detections, metres; 0 where nothing was measured."""
+    boxes = [np.array(d.box) for d in observation.frame.detections]
+    return np.array([centre_depth(observation.depth, box) for box in boxes])
 
 
 def gather(
@@ -122,7 +144,7 @@ def gather(
         object -> keyframe -> sighting.
     """
     seen: dict[int, dict[int, Sighting]] = {i: {} for i in boxes}
-    last: dict[int, tuple[Array, float]] = {}
+    last: dict[int, Look] = {}
     with progress.stage(name, total=len(recording.keyframes)) as stage:
         for k in range(len(recording.keyframes)):
             asked = {i: wish for i in boxes if (wish := wanted(i, k)) is not None}
@@ -131,50 +153,71 @@ def gather(
                 assert observation is not None
                 detection = boxes[i].get(k)
                 around = Surroundings(neighbours(i, k), recording.place.surfaces)
-                sighting = _sight(observation, recording.time_s(k), proposer, wish, detection, around, last.get(i))
-                if sighting is not None:
-                    seen[i][k] = sighting[0]
-                    last[i] = sighting[1]
+                found = look(observation, recording.time_s(k), proposer, wish, detection, around, last.get(i))
+                if found is not None:
+                    seen[i][k] = sight(found, proposer, wish)
+                    last[i] = found
             stage.advance()
     return seen
 
 
-def _sight(
+def look(
     observation: Observation,
     time_s: float,
     proposer: Proposer,
     wish: Wanted,
     detection: Detection | None,
     around: Surroundings,
-    last: tuple[Array, float] | None,
-) -> tuple[Sighting, tuple[Array, float]] | None:
-    """One object in one keyframe; None where it would not be in view. Also its viewpoint and time, for the next."""
+    last: Look | None,
+) -> Look | None:
+    """Where in a keyframe an object is looked for; None where it would not be in view.
+
+    Args:
+        observation: the keyframe.
+        time_s: of the keyframe.
+        proposer: cuts the tile.
+        wish: what is wanted of the object here.
+        detection: its box; without one it is looked for where it is expected.
+        around: what stands around it.
+        last: the look before this one, by which it is known how much of this one is news.
+    """
     model = proposer.model
-    T_camera_world = observation.frame.T_camera_world
     box = None if detection is None else np.array(detection.box)
     if box is None and wish.expected is not None:
         c, T = wish.expected
-        ahead = outlook(model.shapes[c], T_camera_world @ T, observation.frame.camera)
+        ahead = outlook(model.shapes[c], observation.frame.T_camera_world @ T, observation.frame.camera)
         box = ahead.box if ahead.share > 0.0 and (ahead.box[2:] >= 2.0).all() else None
     if box is None:
         return None
     viewpoint = _viewpoint(wish, observation)
-    share = 1.0 if last is None else model.view_share(last[0], viewpoint, time_s - last[1])
+    share = 1.0 if last is None else model.view_share(last.viewpoint, viewpoint, time_s - last.time_s)
     view = proposer.view(observation, box, detection, around, share)
+    return Look(observation.keyframe, time_s, observation.frame.T_world_camera, view, around, viewpoint, last is None)
+
+
+def sight(at: Look, proposer: Proposer, wish: Wanted, known: Sighting | None = None) -> Sighting:
+    """The modes of one object in one keyframe.
+
+    Args:
+        at: the look at it.
+        proposer: who refines.
+        wish: what from, for each class.
+        known: modes of the same look that classes keep for which nothing is wished.
+    """
+    model = proposer.model
+    T_camera_world = se3.inverse(at.T_world_camera)
     modes: list[PoseModes | None] = []
     context: list[Array] = []
     for shape in model.shapes:
         starts = wish.starts.get(shape.index)
         if starts is None or not len(starts):
-            modes.append(None)
-            context.append(np.zeros(0))
+            modes.append(None if known is None else known.modes[shape.index])
+            context.append(np.zeros(0) if known is None else known.context[shape.index])
             continue
-        found = proposer.modes(shape, view, T_camera_world @ starts, probe=shape.index in wish.careful)
+        found = proposer.modes(shape, at.view, T_camera_world @ starts, probe=shape.index in wish.careful)
         modes.append(found)
-        poses = observation.frame.T_world_camera @ found.T_camera_centre
-        context.append(around.log_potential(model, shape, poses))
-    clutter = _log_clutter(proposer, view, modes, first=last is None)
-    return Sighting(observation.keyframe, tuple(modes), tuple(context), clutter), (viewpoint, time_s)
+        context.append(at.around.log_potential(model, shape, at.T_world_camera @ found.T_camera_centre))
+    return Sighting(at.keyframe, tuple(modes), tuple(context), _log_clutter(proposer, at.view, modes, at.first))
 
 
 def _log_clutter(proposer: Proposer, view: View, modes: list[PoseModes | None], first: bool) -> float:

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from ctmap_gtsam.estimate import EXISTS, Estimate
 from ctmap_gtsam.frontend.proposer import distinct
 from ctmap_gtsam.model import Model
+from factors.symmetry import near
 
 Array = NDArray[np.float64]
 
 _KEPT = 8  # poses of a class that an object starts from, at most
 _ONE_POSE = (0.15, 0.015)  # rad, metres: what was believed nearer to each other at different times is one pose
+_LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care at first
 _EVER = 0.05  # an object that never existed with this probability isn't started from
 
 
@@ -39,7 +41,7 @@ class Seed:
     @property
     def best_class(self) -> int:
         """Index in the catalogue, of the most probable class that has a pose."""
-        return max(self.poses, key=lambda c: (self.class_probability[c], -c))
+        return most_probable(self.poses, self.class_probability)
 
     def expected(self, keyframe: int) -> Array:
         """(4, 4) T_world_centre of the best class at a keyframe."""
@@ -54,6 +56,16 @@ class Seed:
         keyframes = sorted(self.believed[c])
         before = [k for k in keyframes if k <= keyframe]
         return self.believed[c][before[-1] if before else keyframes[0]]
+
+
+def most_probable(poses: Mapping[int, Array], probability: Array) -> int:
+    """The class index of the most probable class (C,) that has a pose."""
+    return max(poses, key=lambda c: (probability[c], -c))
+
+
+def careful(poses: Mapping[int, Array], probability: Array) -> frozenset[int]:
+    """Classes whose covariance is worth probing, by their probability (C,)."""
+    return frozenset(c for c in poses if probability[c] > _LIKELY) | {most_probable(poses, probability)}
 
 
 def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
@@ -82,3 +94,60 @@ def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
         then = modes.keyframe[rows]
         believed[shape.index] = {int(k): T[then == k] for k in np.unique(then)}
     return Seed(object_id, poses, believed, forward.class_probability[row, -1])
+
+
+@dataclass(frozen=True)
+class Believed:
+    """One object of the forward pass at one keyframe."""
+
+    poses: Mapping[int, Array]
+    """class index -> (n, 4, 4) T_world_centre, the heaviest first"""
+    class_probability: Array
+    """(C,)"""
+
+    @property
+    def best_class(self) -> int:
+        """Index in the catalogue, of the most probable class that has a pose."""
+        return most_probable(self.poses, self.class_probability)
+
+
+def believed(forward: Estimate, model: Model, keyframe: int) -> dict[int, Believed]:
+    """What a filter says at a keyframe, by object id: of what is there, or was taken away. It knows the past alone."""
+    modes = forward.modes
+    here = np.flatnonzero(modes.keyframe == keyframe)
+    here = here[np.argsort(-modes.log_weight[here], kind="stable")]
+    out = {}
+    for row in np.unique(modes.object[here]):
+        if forward.existence[row, : keyframe + 1].max() < _EVER:
+            continue
+        own = here[modes.object[here] == row]
+        poses = {}
+        for class_id in np.unique(modes.class_id[own]):
+            shape = model.shapes[model.catalogue.index(int(class_id))]
+            poses[shape.index] = shape.to_centre(modes.T_world_object[own[modes.class_id[own] == class_id]])
+        out[int(forward.object_id[row])] = Believed(poses, forward.class_probability[row, keyframe])
+    return dict(sorted(out.items()))
+
+
+def news(model: Model, known: Mapping[int, Array], poses: Mapping[int, Array]) -> dict[int, Array]:
+    """Class index -> those poses that are none of the known ones of the class."""
+    out = {}
+    for c, some in poses.items():
+        there = known.get(c)
+        if there is None or not len(there):
+            out[c] = some
+            continue
+        fresh = [T for T in some if not near(there, T, model.shapes[c].symmetry, *_ONE_POSE).any()]
+        if fresh:
+            out[c] = np.stack(fresh)
+    return out
+
+
+def remembered(model: Model, known: Mapping[int, Array], poses: Mapping[int, Array]) -> dict[int, Array]:
+    """Class index -> poses (n, 4, 4) that are apart from each other, the latest first, at most a few."""
+    out = dict(known)
+    for c, some in poses.items():
+        every = np.concatenate([some, known[c]]) if c in known else some
+        order = -np.arange(len(every), dtype=float)
+        out[c] = every[distinct(model.shapes[c], every, order, _ONE_POSE, _KEPT)]
+    return out

@@ -6,35 +6,42 @@ trellis; solve one graph of all poses; and the smoothed map is what the next rou
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.runtime.checkpoint import Checkpoint
+from ctmap_gtsam.runtime.settings import to_dict
+from ctmap_gtsam.runtime.sources import code
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
-from ctmap_gtsam.smoothing.graph import Camera, Measured, Smoothed, SmootherGraph, build, smooth
+from ctmap_gtsam.smoothing.discrete import Posterior, Stage
+from ctmap_gtsam.smoothing.graph import Measured, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
-from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, in_world, record
-from ctmap_gtsam.smoothing.seeding import Seed, seeds
+from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
+from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
+from ctmap_gtsam.smoothing.seeding import Seed, careful, seeds
+from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.writing import write
 from factors.symmetry import residual
 from sequences.progress import SILENT, Progress
-from sequences.types import Run
+from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
 Objects = Mapping[int, tuple[Shape, Sequence[Measured]]]
 Look = Callable[[SmootherGraph, Smoothed], object]
 """Who looks at the last round's graph and its solution"""
 
-_LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care in the first round
 _SETTLED = (0.002, 0.0002)  # rad, metres: poses that move less from round to round have settled
 
 
@@ -50,6 +57,22 @@ class Map:
     """number of factors by kind"""
 
 
+@dataclass(frozen=True)
+class Rounds:
+    """How far it is: all that the next round, or the estimate, is made from."""
+
+    current: Map
+    energies: list[dict[str, float]]
+    """of each round so far"""
+    hypotheses_scored: int
+    settled: bool
+    """whether the last round changed nothing of note"""
+
+
+_KEPT = (Rounds, Map, Smoothed, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
+"""what `Rounds` is made of"""
+
+
 def smooth_run(
     run: Run,
     forward: Estimate,
@@ -57,6 +80,7 @@ def smooth_run(
     *,
     progress: Progress | None = None,
     look: Look | None = None,
+    keep: Path | None = None,
 ) -> Estimate:
     """The factor-graph smoother over a run, from the hypotheses of a forward pass.
 
@@ -67,6 +91,8 @@ def smooth_run(
         config: settings; None = the defaults.
         progress: who is told how far it is.
         look: is handed the last round's graph and its solution, such as for `export.graph`.
+        keep: a file in which the last round is kept while the next is made. If it is there already, of the same run,
+            forward pass, settings and code, work goes on from it, and ends in the same bytes.
 
     Returns:
         The estimate p(o_t | z_1:T) at the forward pass's keyframes.
@@ -81,18 +107,53 @@ def smooth_run(
     model = Model(run.catalogue, config, context=not str(forward.meta["method"]).endswith("-t"))
     proposer = Proposer(model)
     recording = record(run, forward.keyframe_frame, model, told)
-    current = _first_round(recording, proposer, seeds(forward, model), told)
-    energies = [dict(current.energy)]
-    for number in range(config.smoother.rounds):
-        following = _next_round(recording, proposer, current, told, f"round {number + 2}")
-        settled = _settled(current, following, model)
-        current = following
-        energies.append(dict(current.energy))
-        if settled and number + 1 >= 2:
-            break
+    checkpoint = None if keep is None else Checkpoint(keep, _key(run, forward, config), _KEPT)
+    state: Rounds | None = None if checkpoint is None else checkpoint.load()
+    if state is None:
+        first = _first_round(recording, proposer, seeds(forward, model), told)
+        state = _stepped(first, [], False, proposer, checkpoint)
+    proposer.hypotheses_scored = state.hypotheses_scored
+    while not _enough(state, config):
+        following = _next_round(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
+        settled = _settled(state.current, following, model)
+        state = _stepped(following, state.energies, settled, proposer, checkpoint)
+    current = state.current
     if look is not None:
-        look(_graph(recording, model, current.things)[0], current.smoothed)
-    return write(recording, model, current.things, current.smoothed, _diagnostics(proposer, current, energies))
+        built, objects = _graph(recording, model, current.things)
+        look(built, smooth(built, model, objects, len(recording.keyframes)))
+    estimate = write(recording, model, current.things, current.smoothed, _diagnostics(proposer, state))
+    if checkpoint is not None:
+        checkpoint.remove()
+    return estimate
+
+
+def _stepped(
+    following: Map, energies: list[dict[str, float]], settled: bool, proposer: Proposer, checkpoint: Checkpoint | None
+) -> Rounds:
+    """The state after a round, which is kept."""
+    state = Rounds(following, [*energies, dict(following.energy)], proposer.hypotheses_scored, settled)
+    if checkpoint is not None:
+        checkpoint.save(state)
+    return state
+
+
+def _enough(state: Rounds, config: Config) -> bool:
+    """At most `smoother.rounds` after the first, and as many as it takes to settle, but for two."""
+    after_first = len(state.energies) - 1
+    return after_first >= config.smoother.rounds or (state.settled and after_first >= 2)
+
+
+def _key(run: Run, forward: Estimate, config: Config) -> dict[str, object]:
+    numbers = hashlib.sha256()
+    for array in (forward.class_probability, forward.existence, *vars(forward.modes).values()):
+        numbers.update(np.ascontiguousarray(array).tobytes())
+    return {
+        "method": forward.meta["method"],
+        "forward": numbers.hexdigest(),
+        "config": to_dict(config),
+        "fingerprint": run.fingerprint,
+        "code": code().estimating,
+    }
 
 
 def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, Seed], progress: Progress) -> Map:
@@ -103,8 +164,8 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
         return Expected(seeds[i].best_class, seeds[i].expected(k), seeds[i].class_probability, 1.0)
 
     def wanted(i: int, k: int) -> Wanted:
-        likely = frozenset(c for c in seeds[i].poses if seeds[i].class_probability[c] > _LIKELY)
-        return Wanted(seeds[i].starts(k), (seeds[i].best_class, seeds[i].expected(k)), likely | {seeds[i].best_class})
+        probed = careful(seeds[i].poses, seeds[i].class_probability)
+        return Wanted(seeds[i].starts(k), (seeds[i].best_class, seeds[i].expected(k)), probed)
 
     boxes = associate(recording, model, seeds, expected)
     sightings = gather(recording, proposer, wanted, boxes, lambda _i, _k: (), progress, "round 1")
@@ -116,44 +177,18 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
     model = proposer.model
 
     def expected(i: int, k: int) -> Expected | None:
-        thing = current.things[i]
-        pose = thing.pose_near(thing.best_class, k)
-        if pose is None:
-            return None
-        there = thing.solid * thing.presence_at(k)
-        return Expected(thing.best_class, pose[0], thing.class_probability, there)
+        return expected_of(current.things[i], k)
 
     def wanted(i: int, k: int) -> Wanted | None:
         thing = current.things[i]
-        best = thing.best_class
-        starts = {}
-        for c in thing.possible(model):
-            # what a keyframe has settled on may be wrong: the middle of its life has another say
-            near = [thing.pose_near(c, k), thing.anchor[None] if c == best and thing.anchor is not None else None]
-            sighting = thing.sightings.get(k)
-            if sighting is not None:
-                near.append(in_world(sighting, c, recording.T_world_camera(k)))
-            starts[c] = np.concatenate([n for n in near if n is not None] or [np.zeros((0, 4, 4))])
-        pose = thing.pose_near(best, k)
-        if pose is None:
-            return None
-        return Wanted(starts, (best, pose[0]), frozenset(thing.likely()))
+        return wanted_of(thing, k, recording, model, thing.sightings.get(k))
 
     def neighbours(i: int, k: int) -> tuple[Neighbour, ...]:
-        there = [_neighbour(thing, k, model) for thing in current.things.values()]
-        return Surroundings(tuple(n for n in there if n is not None), ()).without(i).neighbours
+        return Surroundings(neighbours_of(current.things, k, model), ()).without(i).neighbours
 
     boxes = associate(recording, model, current.things, expected)
     sightings = gather(recording, proposer, wanted, boxes, neighbours, progress, name)
     return _solve(recording, model, boxes, sightings)
-
-
-def _neighbour(thing: Thing, keyframe: int, model: Model) -> Neighbour | None:
-    """An object that is surely there at a keyframe."""
-    pose = thing.present_pose(keyframe)
-    if pose is None:
-        return None
-    return Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.log_evidence)
 
 
 def _solve(
@@ -168,19 +203,16 @@ def _solve(
     built, objects = _graph(recording, model, things)
     smoothed = smooth(built, model, objects, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
-    return Map(things, smoothed, built.energy(smoothed.solution.values), built.count())
+    energy = built.energy(smoothed.solution.values)
+    # the arrays are all that anybody needs from here on, and GTSAM's values can't be kept
+    smoothed = replace(smoothed, solution=replace(smoothed.solution, values=None))
+    return Map(things, smoothed, energy, built.count())
 
 
 def _graph(recording: Recording, model: Model, things: Mapping[int, Thing]) -> tuple[SmootherGraph, Objects]:
     """The graph of all that is, and what each object was taken for."""
-    cameras = [
-        Camera(recording.T_world_camera(k), recording.time_s(k), recording.run.frames[int(f)].visit)
-        for k, f in enumerate(recording.keyframes)
-    ]
-    objects = {
-        i: (model.shapes[thing.best_class], thing.measured(recording)) for i, thing in things.items() if thing.exists
-    }
-    objects = {i: entry for i, entry in objects.items() if entry[1]}
+    cameras = [camera_of(recording, k) for k in range(len(recording.keyframes))]
+    objects = objects_of(things, recording, model)
     return build(model, cameras, recording.run.localisation, objects), objects
 
 
@@ -200,12 +232,12 @@ def _settled(a: Map, b: Map, model: Model) -> bool:
     return True
 
 
-def _diagnostics(proposer: Proposer, current: Map, energies: list[dict[str, float]]) -> dict[str, object]:
-    solution = current.smoothed.solution
+def _diagnostics(proposer: Proposer, state: Rounds) -> dict[str, object]:
+    solution = state.current.smoothed.solution
     return {
         "hypotheses_scored": proposer.hypotheses_scored,
-        "rounds": len(energies),
-        "energy_by_round": energies,
-        "factors": dict(current.factors),
+        "rounds": len(state.energies),
+        "energy_by_round": state.energies,
+        "factors": dict(state.current.factors),
         "solver": {"end": solution.end, "trace": list(solution.trace)},
     }

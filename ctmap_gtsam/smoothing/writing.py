@@ -28,9 +28,9 @@ def write(
     kept = [thing for _, thing in sorted(things.items()) if thing.reported_class in thing.posteriors]
     tables = Tables(len(kept), len(recording.keyframes), len(model.catalogue))
     for row, thing in enumerate(kept):
-        _write_thing(tables, row, thing, recording, model, smoothed)
-        _write_moves(tables, row, thing, recording, model.config.prediction.significant_period_s)
-        _write_ledger(tables, row, thing)
+        for k in range(len(recording.keyframes)):
+            write_at(tables, row, k, thing, recording, model, smoothed.T_world_camera[k])
+        note_class(tables, row, thing)
     return build_estimate(
         recording.run,
         model.config,
@@ -44,32 +44,48 @@ def write(
     )
 
 
-def _write_thing(
-    tables: Tables, row: int, thing: Thing, recording: Recording, model: Model, smoothed: Smoothed
+def write_at(
+    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model, T_world_camera: Array
 ) -> None:
+    """All that is said of an object at a keyframe.
+
+    Args:
+        tables: written to.
+        row: of the object.
+        k: the keyframe.
+        thing: the object.
+        recording: the run.
+        model: potentials.
+        T_world_camera: (4, 4) smoothed.
+    """
+    tables.class_probability[row, k] = thing.class_probability
+    tables.existence[row, k] = thing.solid * thing.presence_at(k)
+    _write_pose(tables, row, k, thing, recording, model, T_world_camera)
+    if k in thing.sightings:
+        _write_move(tables, row, k, thing, recording, model.config.prediction.significant_period_s)
+        _write_ledger(tables, row, k, thing)
+
+
+def _write_pose(
+    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model, T_world_camera: Array
+) -> None:
+    held = thing.held(k)
+    if held is None:
+        return
+    T, covariance = held
     shape = model.shapes[thing.reported_class]
-    free = shape.symmetry.free_axes
-    for k in range(len(recording.keyframes)):
-        tables.class_probability[row, k] = thing.class_probability
-        presence = thing.presence_at(k)
-        tables.existence[row, k] = thing.solid * presence
-        held = thing.held(k)
-        if held is None:
-            continue
-        T, covariance = held
-        camera = recording.run.frames[int(recording.keyframes[k])].camera
-        seen = outlook(shape, np.linalg.inv(smoothed.T_world_camera[k]) @ T, camera)
-        tables.in_view[row, k] = seen.share > 0.0
-        tables.mode(
-            row,
-            k,
-            shape.source.obj_id,
-            thing.chosen_log_weight(k),
-            shape.to_object(T),
-            shape.covariance_to_object(covariance),
-            shape.free_axes_to_object(free),
-        )
-        _write_alternatives(tables, row, k, thing, model)
+    camera = recording.run.frames[int(recording.keyframes[k])].camera
+    tables.in_view[row, k] = outlook(shape, np.linalg.inv(T_world_camera) @ T, camera).share > 0.0
+    tables.mode(
+        row,
+        k,
+        shape.source.obj_id,
+        thing.chosen_log_weight(k),
+        shape.to_object(T),
+        shape.covariance_to_object(covariance),
+        shape.free_axes_to_object(shape.symmetry.free_axes),
+    )
+    _write_alternatives(tables, row, k, thing, model)
 
 
 def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
@@ -96,29 +112,33 @@ def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: M
             )
 
 
-def _write_ledger(tables: Tables, row: int, thing: Thing) -> None:
-    """What each potential says at the mode that the best path goes through; the score vectors' word on the class."""
-    c = thing.reported_class
-    for k, stage, state in zip(thing.keyframes, thing.stages[c], thing.posteriors[c].path, strict=True):
-        modes = thing.sightings[k].modes[c]
-        if modes is None or state >= len(stage.log_evidence):
-            continue
-        depth = float(modes.depth_log_ratio[state])
-        tables.note(row, k, "depth", depth)
-        tables.note(row, k, "detection", float(modes.log_likelihood[state]) - depth)
-        tables.note(row, k, "context", float(stage.log_evidence[state] - modes.log_likelihood[state]))
-    if thing.keyframes:
-        tables.note(row, thing.keyframes[0], "class", float(thing.score_evidence[c]))
-
-
-def _write_moves(tables: Tables, row: int, thing: Thing, recording: Recording, significant_period_s: float) -> None:
-    """A line for every gap between views that is long enough to hold a move, or that probably held one."""
-    posterior = thing.posteriors.get(thing.reported_class)
-    if posterior is None:
+def _write_ledger(tables: Tables, row: int, k: int, thing: Thing) -> None:
+    """What each potential says at the mode that the best path goes through."""
+    c, i = thing.reported_class, thing.keyframes.index(k)
+    modes, stage, state = thing.sightings[k].modes[c], thing.stages[c][i], thing.posteriors[c].path[i]
+    if modes is None or state >= len(stage.log_evidence):
         return
-    frames = recording.run.frames
-    for i, (a, b) in enumerate(zip(thing.keyframes, thing.keyframes[1:], strict=False)):
-        times = [frames[int(recording.keyframes[k])].time_ns for k in (a, b)]
-        if posterior.moved[i] < 0.5 and (times[1] - times[0]) * 1e-9 < significant_period_s:
-            continue
-        tables.move(row, (a, b), float(posterior.moved[i]), (times[0], times[1]))
+    depth = float(modes.depth_log_ratio[state])
+    tables.note(row, k, "depth", depth)
+    tables.note(row, k, "detection", float(modes.log_likelihood[state]) - depth)
+    tables.note(row, k, "context", float(stage.log_evidence[state] - modes.log_likelihood[state]))
+
+
+def note_class(tables: Tables, row: int, thing: Thing) -> None:
+    """The score vectors' word on the class, in the ledger of the first keyframe in view."""
+    if thing.keyframes:
+        tables.note(row, thing.keyframes[0], "class", float(thing.score_evidence[thing.reported_class]))
+
+
+def _write_move(
+    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, significant_period_s: float
+) -> None:
+    """A line for the gap before a view if it is long enough to hold a move, or probably held one."""
+    i = thing.keyframes.index(k) - 1
+    if i < 0:
+        return
+    gap = (thing.keyframes[i], k)
+    moved = float(thing.posteriors[thing.reported_class].moved[i])
+    begin, end = (recording.run.frames[int(recording.keyframes[j])].time_ns for j in gap)
+    if moved >= 0.5 or (end - begin) * 1e-9 >= significant_period_s:
+        tables.move(row, gap, moved, (begin, end))

@@ -99,6 +99,12 @@ def test_a_wrong_setting_is_one_clean_error_and_nothing_is_written(arguments: li
     assert not out.exists()
 
 
+@pytest.mark.parametrize("unfit", [("--no-context",), ("--graph", "graph")], ids=" ".join)
+def test_a_fixed_lag_with_what_it_has_not_is_one_clean_error(unfit: tuple[str, ...], tmp_path: Path) -> None:
+    result = ctmap("smooth", tmp_path, "--out", tmp_path / "out", "--lag", "2", *unfit)
+    assert_clean_error(result, "field:  --lag", unfit[0])
+
+
 @pytest.mark.parametrize("command", ["filter", "smooth", "compare"])
 def test_a_run_that_is_none_is_one_clean_error(command: str, tmp_path: Path) -> None:
     assert_clean_error(ctmap(command, tmp_path / "nowhere", "--out", tmp_path / "out"), str(tmp_path / "nowhere"))

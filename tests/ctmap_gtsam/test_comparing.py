@@ -33,12 +33,16 @@ class Fake:
     ran: Any = None
     needs: tuple[str, ...] = ()
     reads_truth: bool = False
+    resumes: bool = False
 
     def skip(self, run):
         return self.reason
 
-    def run(self, run, config, progress, *needed):
+    def run(self, run, config, progress, *needed, **kept):
         assert self.kind == "estimate"
+        assert kept.keys() == ({"keep"} if self.resumes else set())
+        if self.ran is not None and kept:
+            self.ran.append(kept["keep"])
         assert [estimate.meta["method"] for estimate in needed] == list(self.needs)
         if self.ran is not None:
             self.ran.append(self.name)
@@ -126,6 +130,14 @@ def test_what_a_method_builds_on_runs_before_it_and_once(path, tmp_path, registr
     assert ran[3:] == ["smooth-ct", "filter-ct", "builds"]
     inside["builds"].estimate.save(tmp_path / "inside.npz")
     assert (tmp_path / "inside.npz").read_bytes() == (tmp_path / "builds.npz").read_bytes()
+
+
+def test_a_method_that_works_in_rounds_keeps_them_beside_the_estimates(path, tmp_path, ran):
+    registry = {"slow": Fake("slow", resumes=True, ran=ran)}
+    run = load_run(path)
+    run_methods(run, ["slow"], Config(), registry=registry)
+    run_methods(run, ["slow"], Config(), tmp_path, registry=registry)
+    assert ran == [None, "slow", tmp_path / ".slow.rounds.npz", "slow"]
 
 
 def test_a_method_that_reads_the_truth_is_marked_and_made_again_with_another_truth(path, tmp_path, ran):

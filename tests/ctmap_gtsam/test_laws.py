@@ -40,7 +40,7 @@ BOTH = ("filter-ct", "smooth-ct")
 BLIND = tuple(name for name, method in METHODS.items() if method.run is not None and not method.reads_truth)
 TRUTH = ("scene_gt*.json", "scene_camera_gt.json", "mask", "mask_visib")
 
-each_estimator = pytest.mark.parametrize("method", BOTH)
+each_estimator = pytest.mark.parametrize("method", [*BOTH, "lag-ct"])
 each_of_three = pytest.mark.parametrize("method", [*BOTH, "ffbsi-ct"])
 
 

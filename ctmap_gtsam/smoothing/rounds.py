@@ -1,0 +1,74 @@
+"""What a round asks the images for and hands to the graph: shared by the batch and the fixed lag."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmap_gtsam.frontend.surroundings import Neighbour
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
+from ctmap_gtsam.smoothing.association import Expected
+from ctmap_gtsam.smoothing.belief import Thing
+from ctmap_gtsam.smoothing.graph import Camera, Measured
+from ctmap_gtsam.smoothing.modes import Recording, Sighting, Wanted, in_world
+
+Array = NDArray[np.float64]
+
+
+def expected_of(thing: Thing, keyframe: int) -> Expected | None:
+    """What the map says of an object where boxes are assigned; None where it has no pose."""
+    pose = thing.pose_near(thing.best_class, keyframe)
+    if pose is None:
+        return None
+    return Expected(thing.best_class, pose[0], thing.class_probability, thing.solid * thing.presence_at(keyframe))
+
+
+def wanted_of(thing: Thing, keyframe: int, recording: Recording, model: Model, known: Sighting | None) -> Wanted | None:
+    """What is believed of an object at a keyframe, and the modes of a sighting; None where it has no pose.
+
+    Args:
+        thing: the object.
+        keyframe: where it is looked for.
+        recording: the run.
+        model: says which classes are possible.
+        known: the sighting whose modes are tried, too.
+    """
+    best = thing.best_class
+    starts = {}
+    for c in thing.possible(model):
+        # what a keyframe has settled on may be wrong: the middle of its life has another say
+        near = [thing.pose_near(c, keyframe), thing.anchor[None] if c == best and thing.anchor is not None else None]
+        if known is not None:
+            near.append(in_world(known, c, recording.T_world_camera(known.keyframe)))
+        starts[c] = np.concatenate([n for n in near if n is not None] or [np.zeros((0, 4, 4))])
+    pose = thing.pose_near(best, keyframe)
+    return None if pose is None else Wanted(starts, (best, pose[0]), frozenset(thing.likely()))
+
+
+def neighbours_of(things: Mapping[int, Thing], keyframe: int, model: Model) -> tuple[Neighbour, ...]:
+    """The objects that are surely there at a keyframe."""
+    there = ((thing, thing.present_pose(keyframe)) for thing in things.values())
+    return tuple(
+        Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.log_evidence)
+        for thing, pose in there
+        if pose is not None
+    )
+
+
+def camera_of(recording: Recording, keyframe: int) -> Camera:
+    """As recorded."""
+    visit = recording.run.frames[int(recording.keyframes[keyframe])].visit
+    return Camera(recording.T_world_camera(keyframe), recording.time_s(keyframe), visit)
+
+
+def objects_of(
+    things: Mapping[int, Thing], recording: Recording, model: Model
+) -> dict[int, tuple[Shape, Sequence[Measured]]]:
+    """What the graph takes: the class and the chosen modes of each object that exists and was measured."""
+    chosen = {
+        i: (model.shapes[thing.best_class], thing.measured(recording)) for i, thing in things.items() if thing.exists
+    }
+    return {i: entry for i, entry in chosen.items() if entry[1]}
