@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
@@ -184,6 +184,15 @@ class Model:
             )
         return np.log1p(-d.detection_probability * visible) - np.log1p(-d.clutter_rate * visible)
 
+    def told(self, witness: ArrayLike) -> Array:
+        """By what all views tell a known thing from one of unknown mesh (...), nats, for sums of `witness` (...).
+
+        It has an end: some things of unknown mesh are taken for known ones as often as those are found
+        (`detector.deceived`).
+        """
+        share = self.config.detector.deceived
+        return -np.logaddexp(np.log1p(-share) - np.asarray(witness), np.log(share))
+
     def existence(
         self,
         log_evidence: Array,
@@ -196,8 +205,8 @@ class Model:
 
         That no pose explains more than clutter would may be the search's fault: a part of such tracks are known things
         all the same (`detector.unfound`), of the class that the scores say. That a pose explains the depth however well
-        may be because of a thing of unknown mesh that looks alike (`detector.lookalike`): between the two the detector
-        decides, which finds known things in most views.
+        may be because of a thing of unknown mesh that looks alike (`detector.lookalike`). In both cases depth can't
+        tell, and the detector decides, see `told`.
 
         Args:
             log_evidence: (C,) of each class at the poses that were found, scores and context included; -inf for none.
@@ -209,12 +218,16 @@ class Model:
         Returns:
             P(exists) and P(class | exists) (C,).
         """
+        d = self.config.detector
         found = mixture.log_sum(log_evidence)
-        alike = found + float(np.log(self.config.detector.lookalike)) - witness
-        p_found, p_clutter, *_ = np.exp(mixture.normalised(np.array([found, log_clutter, alike, *log_rivals])))
+        told = float(self.told(witness))
+        unfound = d.unfound if np.isfinite(score_evidence).any() else 0.0
+        with np.errstate(divide="ignore"):
+            rivals = [log_clutter + np.log(unfound) + told, log_clutter + np.log1p(-unfound)]
+        alike = found + float(np.log(d.lookalike)) - told
+        p_found, p_unfound, *_ = np.exp(mixture.normalised(np.array([found, *rivals, alike, *log_rivals])))
         by_pose, by_scores = np.exp(mixture.normalised(log_evidence)), np.exp(mixture.normalised(score_evidence))
-        unfound = self.config.detector.unfound if np.isfinite(score_evidence).any() else 0.0
-        each = p_found * by_pose + unfound * p_clutter * by_scores
+        each = p_found * by_pose + p_unfound * by_scores
         total = float(each.sum())
         return total, each / total if total > 0.0 else by_pose
 

@@ -55,6 +55,12 @@ class Detector:
     lookalike: float = option(
         0.1, "chance that what a known mesh explains is something else of its shape", low=1e-9, high=0.5
     )
+    deceived: float = option(
+        0.2,
+        "share of things of unknown mesh that are taken for known ones as often as those are found",
+        low=1e-9,
+        high=0.9,
+    )
     confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
     score_floor: float = option(0.05, "weight of a uniform belief mixed into score vectors", low=1e-6, high=0.9)
 

@@ -6,9 +6,6 @@ Formulas: Barfoot, State Estimation for Robotics (2017), ch. 7; Sola et al., A m
 
 from __future__ import annotations
 
-import math
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -108,36 +105,10 @@ def transform(T: Array, points: Array) -> Array:
 
 def exp(xi: Array) -> Array:
     """Tangents (..., 6) [rotation, translation] -> (..., 4, 4)."""
-    xi = np.ascontiguousarray(xi, dtype=np.float64)
-    T = np.empty((*xi.shape[:-1], 4, 4))
-    _exp(xi.reshape(-1, 6), T.reshape(-1, 4, 4))
-    return T
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _exp(xi, out):
-    """(n, 6) -> `out` (n, 4, 4): R = I + s W + c W^2 and t = (I + c W + d W^2) v, coefficients as `_coefficients`."""
-    for n in range(len(xi)):
-        x, y, z = xi[n, 0], xi[n, 1], xi[n, 2]
-        square = x * x + y * y + z * z
-        angle = math.sqrt(square)
-        if angle < _SMALL:
-            s, c, d = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-        else:
-            half = math.sin(0.5 * angle)
-            s = math.sin(angle) / angle
-            c, d = 2.0 * half * half / square, (angle - math.sin(angle)) / (square * angle)
-        T = out[n]
-        T[0, 0], T[0, 1], T[0, 2] = 1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
-        T[1, 0], T[1, 1], T[1, 2] = c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x
-        T[2, 0], T[2, 1], T[2, 2] = c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)
-        a, b, e = xi[n, 3], xi[n, 4], xi[n, 5]
-        # W v, and W of it
-        p, q, r = y * e - z * b, z * a - x * e, x * b - y * a
-        T[0, 3] = a + c * p + d * (y * r - z * q)
-        T[1, 3] = b + c * q + d * (z * p - x * r)
-        T[2, 3] = e + c * r + d * (x * q - y * p)
-        T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
+    xi = np.asarray(xi, dtype=np.float64)
+    w, v = xi[..., :3], xi[..., 3:]
+    V = so3_left_jacobian(w)
+    return make(so3_exp(w), (V @ v[..., None])[..., 0])
 
 
 def log(T: Array) -> Array:

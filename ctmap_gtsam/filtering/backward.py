@@ -296,8 +296,8 @@ def last_there(end: Array, left: Array, stages: Sequence[Stage], model: Model) -
         model: potentials.
     """
     clutter = stages[-1].log_clutter + np.log1p(-model.config.detector.unfound)
-    witness = np.array([stage.witness for stage in stages])
-    alike = float(np.log(model.config.detector.lookalike)) - witness
+    told = model.told([stage.witness for stage in stages])
+    alike = float(np.log(model.config.detector.lookalike)) - told
     still = log_sum(stages[-1].log_evidence) + alike[-1]
     rivals = [0.0, clutter, still, *(log_sum(left) + alike)]
     share = np.exp(mixture.normalised(np.concatenate([left.ravel(), rivals])))[: left.size]

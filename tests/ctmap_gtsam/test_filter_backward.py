@@ -29,7 +29,7 @@ from tests.ctmap_gtsam.gaussian import (
 )
 from tests.ctmap_gtsam.scenes import CHEAP, assert_the_seed_decides, classes, config_of, model_of, small_run
 
-CONFIG = config_of(*CHEAP, "filter.search_every=2", "filter.trajectories=100")
+CONFIG = config_of(*CHEAP, "filter.particles=150", "frontend.fresh_poses=400", "frontend.refined_poses=24")
 MODEL = model_of("mug", "soup_can")
 MUG = MODEL.shapes[0]
 SPREAD = Spread(0.05, 0.005)
@@ -183,7 +183,8 @@ def test_what_is_said_of_presence_and_class_is_all_stories_weighed_one_by_one():
     leave[3] = [1.0 - MODEL.stay_probability(shape.source, 97.0) for shape in MODEL.shapes]
     stories = np.exp(evidence[:4]) * leave
     never = np.exp(2.0) * (1.0 - MODEL.config.detector.unfound) + 1.0
-    double = MODEL.config.detector.lookalike * np.exp(-witness)
+    deceived = MODEL.config.detector.deceived
+    double = MODEL.config.detector.lookalike * ((1.0 - deceived) * np.exp(-witness) + deceived)
     never += double[:4] @ stories.sum(axis=1) + double[4] * np.exp(evidence[4]).sum()
     end = np.array([0.05, 0.15])
     last = last_there(end, leaving(stages, None, MODEL), stages, MODEL)
@@ -194,8 +195,9 @@ def test_what_is_said_of_presence_and_class_is_all_stories_weighed_one_by_one():
 def test_what_is_known_to_be_elsewhere_was_there_until_it_was_taken():
     stages = [stage_of(k, e) for k, e in enumerate((20.0, 40.0, 60.0))]
     last = last_there(np.zeros(2), leaving(stages, round(3600e9), MODEL), stages, MODEL)
-    assert last.sum() == pytest.approx(1.0, abs=1e-3)
-    assert last[-1, 0] > 0.99
+    # or it was a look-alike, which none is known to have found elsewhere
+    assert last.sum() > 0.7
+    assert last[-1, 0] > 0.99 * last.sum()
 
 
 def test_trajectories_begin_where_the_thing_was_last_there():

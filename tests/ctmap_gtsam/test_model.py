@@ -37,7 +37,8 @@ def test_classes_have_no_order(evidence, scores, clutter, rival, order):
 def test_what_poses_explain_well_exists_whatever_the_scores_say(scores, clutter):
     evidence = clutter + np.array([0.0, 60.0, 20.0])
     exists, classes = MODEL.existence(evidence, scores, clutter, SEEN, clutter)
-    assert exists == pytest.approx(1.0)
+    alike = MODEL.config.detector.lookalike * MODEL.config.detector.deceived
+    assert exists == pytest.approx(1.0 / (1.0 + alike))
     assert np.argmax(classes) == 1
 
 
@@ -45,7 +46,8 @@ def test_what_poses_explain_well_exists_whatever_the_scores_say(scores, clutter)
 def test_what_no_pose_explains_may_still_be_what_the_detector_says(evidence):
     scores = np.array([1.0, 3.0, -2.0])
     exists, classes = MODEL.existence(evidence, scores, evidence.max() + 60.0, SEEN, 0.0)
-    assert exists == pytest.approx(UNFOUND, abs=1e-9) or evidence.max() + 60.0 < 30.0
+    odds = UNFOUND / (1.0 - UNFOUND) * np.exp(MODEL.told(SEEN))
+    assert exists == pytest.approx(odds / (1.0 + odds), abs=1e-9) or evidence.max() + 60.0 < 30.0
     np.testing.assert_allclose(classes, np.exp(scores) / np.exp(scores).sum(), atol=1e-6)
 
 
@@ -62,7 +64,15 @@ def test_where_nothing_is_nothing_exists_and_without_poses_neither():
 def test_between_a_thing_and_its_look_alike_the_detector_decides_however_well_a_pose_explains(evidence, witness):
     """Depth can't tell them apart, so no amount of it makes what the detector never finds exist."""
     exists, _ = MODEL.existence(np.array([evidence, 0.0, 0.0]), np.zeros(3), -100.0, witness, -100.0)
-    assert exists == pytest.approx(1.0 / (1.0 + MODEL.config.detector.lookalike * np.exp(-witness)), rel=1e-3)
+    alike = MODEL.config.detector.lookalike * np.exp(-MODEL.told(witness))
+    assert exists == pytest.approx(1.0 / (1.0 + alike), rel=1e-3)
+
+
+def test_what_the_detector_tells_is_bounded_by_how_often_it_is_deceived():
+    assert MODEL.told(0.0) == pytest.approx(0.0)
+    assert (np.diff(MODEL.told(np.linspace(-50.0, 50.0, 20))) >= 0.0).all()
+    assert MODEL.told(500.0) == pytest.approx(-np.log(MODEL.config.detector.deceived))
+    assert MODEL.told(-30.0) == pytest.approx(-30.0 - np.log1p(-MODEL.config.detector.deceived), abs=1e-6)
 
 
 @given(st.floats(0.05, 1.0))
