@@ -11,7 +11,9 @@ from ctmap_gtsam.runtime.versions import versions
 from sequences.errors import InputError
 from sequences.progress import SILENT, Progress
 
-BENCHES = {name: f"ctmap_gtsam.bench.{name}" for name in ("detector", "highlight", "realism", "render", "solver")}
+BENCHES = {
+    name: f"ctmap_gtsam.bench.{name}" for name in ("detector", "highlight", "realism", "render", "solver", "spread")
+}
 BENCHES |= {name: f"ctmap_gtsam.bench.scaling.{name}" for name in ("filter", "smooth")}
 """Name -> module"""
 

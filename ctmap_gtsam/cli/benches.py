@@ -207,6 +207,32 @@ def _sizes(quick: bool) -> Any:
     return QUICK if quick else FULL
 
 
+@bench_app.command()
+def spread(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Recordings that have a truth.", show_default=False)
+    ],
+    methods: Annotated[
+        str, typer.Option("--methods", metavar="A,B,...", help="Methods of `ctmap compare`.")
+    ] = "filter-ct,smooth-ct",
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Run each method with so many seeds.")] = 10,
+    disturb: Annotated[
+        bool, typer.Option("--disturb", help="Give the recorded cameras an error of 2 cm and 2 degrees.")
+    ] = False,
+    json_file: JsonFile = None,
+    config_file: ConfigFile = None,
+    assignments: Assignments = None,
+    seed: Seed = None,
+) -> None:
+    """Every metric on recordings over several seeds: median and extremes, so that chance isn't taken for progress.
+
+    Example: `ctmap bench spread recordings/desk --seeds 10 --disturb --json spread.json`
+    """
+    names = tuple(name.strip() for name in methods.split(","))
+    options = {"runs": tuple(runs), "methods": names, "seeds": seeds, "disturb": disturb}
+    _figures("spread", json_file, config_file, assignments, seed, **options)
+
+
 def _figures(
     name: str,
     json_file: Path | None,
