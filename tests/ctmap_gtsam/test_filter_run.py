@@ -112,7 +112,8 @@ def test_a_thing_that_the_detector_misses_is_still_there():
     run, truth = small_run(frames=8, seen=lambda k, name: name != "mug" or k < 4)
     estimate = filter_run(run, CONFIG)
     mug = int(np.argmin(np.linalg.norm(estimate.pose[:, 3, :3, 3] - truth["mug"][:3, 3], axis=-1)))
-    assert estimate.existence[mug, -1] > 0.8
+    # half of its views found it: doubted, and part of the map
+    assert 0.5 < estimate.existence[mug, -1] < estimate.existence[mug, 3]
     assert estimate.best_class[mug, -1] == run.catalogue.classes[2].obj_id
     assert np.linalg.norm(estimate.pose[mug, -1, :3, 3] - estimate.pose[mug, 3, :3, 3]) < 0.005
 
