@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betaln
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
@@ -127,7 +126,7 @@ class Model:
         if detection is not None:
             rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
             boxes = self.box(np.array(detection.box), rendered, image_size)
-        return self.kappa * scores.log_ratio + self.detection(scores.visible_share, boxes)
+        return self.kappa * scores.log_ratio + self.detection(_shares(scores), boxes)
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
@@ -168,28 +167,38 @@ class Model:
         fit = 0.0 if first else float(self.box(box, box[None], image_size)[0]) - _EDGES
         return np.full(len(visible), np.log(rate) + fit)
 
-    def told(self, counts: ArrayLike) -> Array:
-        """By what the detector tells a known thing from one of unknown mesh (...), nats.
+    def witness(self, scores: Scores, detected: bool) -> Array:
+        """What a track's box in a view, or the lack of one, says (K,) for a known thing against a look-alike, nats.
 
-        Known things are found in most views, but how often differs from thing to thing: one that is seen edge-on is
-        found in half of them. So the rates are Beta variables, and a view that misses a thing often found costs little.
-        How well boxes fit says nothing: a look-alike's would fit as well.
+        Known things are found in most views. How well the box fits says nothing: the look-alike's would fit as well.
 
         Args:
-            counts: (..., 2) views in which it was to be seen and was found, and in which it was missed, by `visible`
-                shares.
+            scores: of poses (K).
+            detected: whether there is a box.
         """
-        d, counts = self.config.detector, np.asarray(counts, dtype=np.float64)
-        rates = (d.detection_probability, d.detection_views), (d.clutter_rate, d.clutter_views)
-        known, alike = (_beta_binomial(counts, rate * views, (1.0 - rate) * views) for rate, views in rates)
-        return known - alike
+        d, visible = self.config.detector, _shares(scores)
+        if detected:
+            # a box where next to nothing shows is another thing's
+            return np.log(
+                (d.detection_probability * visible + d.box_outlier) / (d.clutter_rate * visible + d.box_outlier)
+            )
+        return np.log1p(-d.detection_probability * visible) - np.log1p(-d.clutter_rate * visible)
+
+    def told(self, witness: ArrayLike) -> Array:
+        """By what all views tell a known thing from one of unknown mesh (...), nats, for sums of `witness` (...).
+
+        It has an end: some things of unknown mesh are taken for known ones as often as those are found
+        (`detector.deceived`).
+        """
+        share = self.config.detector.deceived
+        return -np.logaddexp(np.log1p(-share) - np.asarray(witness), np.log(share))
 
     def existence(
         self,
         log_evidence: Array,
         score_evidence: Array,
         log_clutter: float,
-        counts: ArrayLike,
+        witness: float,
         *log_rivals: float,
     ) -> tuple[float, Array]:
         """P(a track is a known thing), and its class.
@@ -203,7 +212,7 @@ class Model:
             log_evidence: (C,) of each class at the poses that were found, scores and context included; -inf for none.
             score_evidence: (C,) the scores' part of it; -inf for classes that have no pose.
             log_clutter: log evidence of something that no mesh explains.
-            counts: (2,) of views that found and missed the most probable class, see `told`.
+            witness: what all boxes and their absences say for the most probable class, see `witness`.
             log_rivals: of what else it may be.
 
         Returns:
@@ -211,7 +220,7 @@ class Model:
         """
         d = self.config.detector
         found = mixture.log_sum(log_evidence)
-        told = float(self.told(counts))
+        told = float(self.told(witness))
         unfound = d.unfound if np.isfinite(score_evidence).any() else 0.0
         with np.errstate(divide="ignore"):
             rivals = [log_clutter + np.log(unfound) + told, log_clutter + np.log1p(-unfound)]
@@ -223,6 +232,6 @@ class Model:
         return total, each / total if total > 0.0 else by_pose
 
 
-def _beta_binomial(counts: Array, a: float, b: float) -> Array:
-    """log P(so many found and missed, in one order) (...) for counts (..., 2) at a rate of Beta(a, b)."""
-    return np.asarray(betaln(a + counts[..., 0], b + counts[..., 1]) - betaln(a, b))
+def _shares(scores: Scores) -> Array:
+    """(K,) of each silhouette that is visible; 0 out of view."""
+    return np.divide(scores.visible, scores.covered, out=np.zeros_like(scores.visible), where=scores.covered > 0)

@@ -43,11 +43,9 @@ class Detector:
     """What is believed of the detector."""
 
     detection_probability: float = option(0.9, "of an object in full view", low=0.01, high=0.999)
-    detection_views: float = option(5.0, "views that its being the same for all things is worth", low=0.1)
     box_sigma: float = option(0.05, "scale of a box edge's error, as a share of the box's size", low=0.005)
     box_outlier: float = option(0.02, "share of boxes that have nothing to do with the object", low=1e-6, high=0.5)
     clutter_rate: float = option(0.3, "chance that clutter is detected again where it was", low=0.01, high=0.99)
-    clutter_views: float = option(2.0, "views that its being the same for all clutter is worth", low=0.1)
     unfound: float = option(
         0.4,
         "chance that a track of which no pose explains more than clutter is a known thing all the same",
@@ -56,6 +54,12 @@ class Detector:
     )
     lookalike: float = option(
         0.1, "chance that what a known mesh explains is something else of its shape", low=1e-9, high=0.5
+    )
+    deceived: float = option(
+        0.2,
+        "share of things of unknown mesh that are taken for known ones as often as those are found",
+        low=1e-9,
+        high=0.9,
     )
     confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
     score_floor: float = option(0.05, "weight of a uniform belief mixed into score vectors", low=1e-6, high=0.9)

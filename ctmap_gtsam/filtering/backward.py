@@ -296,7 +296,7 @@ def last_there(end: Array, left: Array, stages: Sequence[Stage], model: Model) -
         model: potentials.
     """
     clutter = stages[-1].log_clutter + np.log1p(-model.config.detector.unfound)
-    told = model.told([stage.counts for stage in stages])
+    told = model.told([stage.witness for stage in stages])
     alike = float(np.log(model.config.detector.lookalike)) - told
     still = log_sum(stages[-1].log_evidence) + alike[-1]
     rivals = [0.0, clutter, still, *(log_sum(left) + alike)]

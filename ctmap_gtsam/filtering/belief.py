@@ -72,8 +72,8 @@ class Belief:
     """(C,) log evidence of the visits before"""
     log_clutter: float
     """log evidence of something that no mesh explains"""
-    counts: Array
-    """(2,) views that found it where it was to be seen, and that missed it: see `Model.told`"""
+    witness: float
+    """what its boxes and their absences say for a known thing against a look-alike, nats"""
     log_elsewhere: float
     """log evidence of having been moved to where nobody looked"""
     visit: int
@@ -217,7 +217,7 @@ class Updater:
             score_sum=score_sum,
             score_evidence=np.zeros(n),
             log_clutter=0.0,
-            counts=np.zeros(2),
+            witness=0.0,
             log_elsewhere=-np.inf,
             visit=observation.frame.visit,
             first_ns=observation.frame.time_ns,
@@ -285,7 +285,7 @@ class Updater:
             classes=weighed,
             log_evidence=belief.class_log_evidence(self.model),
             log_clutter=belief.log_clutter,
-            counts=belief.counts,
+            witness=belief.witness,
         )
         return replace(belief, past=past.joined(stage))
 
@@ -307,7 +307,7 @@ class Updater:
         there = float(log_sum(log_evidence + context))
         scores = belief.score_evidence + self.model.class_evidence(belief.score_sum)
         posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
-        rivals = (belief.log_clutter, belief.counts, 0.0, belief.log_elsewhere)
+        rivals = (belief.log_clutter, belief.witness, 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
         # particles are what views of this camera agree on; that the camera itself is elsewhere they can't know
         shared = np.diag(self.model.shared_variance(self.localisation, float(np.linalg.norm(belief.viewpoint))))
@@ -569,7 +569,7 @@ class Updater:
         return replace(
             belief,
             log_clutter=belief.log_clutter + self.proposer.log_clutter(shape, view, T, first=belief.steps == 1),
-            counts=belief.counts + self.proposer.counts(shape, view, T),
+            witness=belief.witness + self.proposer.witness(shape, view, T),
         )
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:

@@ -61,8 +61,8 @@ class Stage:
     log_evidence: Array
     """(C,) of each class at this place, prior and scores included"""
     log_clutter: float
-    counts: Array
-    """(2,) views that found it where it was to be seen, and that missed it: see `Model.told`"""
+    witness: float
+    """for a known thing against one of unknown mesh that looks alike, nats"""
     joins: bool = False
     """the stages before are of another belief, which turned out to be of the same object"""
 

@@ -80,8 +80,8 @@ class PoseModes:
     """(n,) the depth's part of it"""
     covariance: Array
     """(n, 6, 6) of the right tangent, from the score's own shape"""
-    counts: Array
-    """(n, 2) of how much of a view it is that found the thing there, and that missed it: see `Model.told`"""
+    witness: Array
+    """(n,) what the view's box or its absence says for a known thing there against a look-alike, nats"""
 
     def __len__(self) -> int:
         return len(self.log_likelihood)
@@ -210,11 +210,14 @@ class Proposer:
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe)
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
-        return PoseModes(poses, score[keep], depth, covariance, _counts(view, scores)[keep])
+        return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
 
-    def counts(self, shape: Shape, view: View, T_camera_centre: Array) -> Array:
-        """(2,) how much of a view it is that found a thing at a pose (4, 4), and that missed it: see `Model.told`."""
-        return np.asarray(_counts(view, self.score(shape, view, T_camera_centre[None])[1])[0])
+    def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
+        """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
+        return float(self._witness(view, self.score(shape, view, T_camera_centre[None])[1])[0])
+
+    def _witness(self, view: View, scores: Scores) -> Array:
+        return view.share * self.model.witness(scores, view.detection is not None)
 
     def near(self, shape: Shape, view: View, T_camera_centre: Array, reach: Array) -> float:
         """The best log-likelihood of a view about one pose (4, 4): there, or where depth draws it, if that is in reach.
@@ -454,11 +457,5 @@ def _widths(drop: Array) -> Array:
     return np.where(np.sqrt(square) > _RIPPLE * parabola, np.sqrt(square), parabola)
 
 
-def _counts(view: View, scores: Scores) -> Array:
-    """(K, 2): the visible share of poses, by the share of the view that is news, as found or as missed."""
-    seen, none = view.share * scores.visible_share, np.zeros(len(scores.covered))
-    return np.stack([none, seen] if view.detection is None else [seen, none], axis=-1)
-
-
 def _no_modes() -> PoseModes:
-    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros((0, 2)))
+    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros(0))

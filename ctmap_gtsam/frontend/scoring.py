@@ -83,11 +83,6 @@ class Scores:
     box: Array
     """(K, 4) enclosing box (x0, y0, x1, y1) of the visible samples in image pixels; NaN where there are none"""
 
-    @property
-    def visible_share(self) -> Array:
-        """(K,) of each silhouette that is visible; 0 out of view."""
-        return np.divide(self.visible, self.covered, out=np.zeros_like(self.visible), where=self.covered > 0)
-
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _without_object(z, background, parameters):

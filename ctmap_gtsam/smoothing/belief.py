@@ -220,18 +220,18 @@ def judge(
     log_evidence = evidence + scores - np.log(len(model.shapes))
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
     best = int(np.argmax(log_evidence))
-    counts = _counts(stages[best], posteriors[best], sightings, best) if best in stages else np.zeros(2)
-    posterior = model.existence(log_evidence, posed, clutter, counts, 0.0)
+    witness = _witness(stages[best], posteriors[best], sightings, best) if best in stages else 0.0
+    posterior = model.existence(log_evidence, posed, clutter, witness, 0.0)
     return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior)
 
 
-def _counts(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping[int, Sighting], c: int) -> Array:
-    """(2,) views that found and that missed it along the best path of a class, where it was measured."""
-    total = np.zeros(2)
+def _witness(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping[int, Sighting], c: int) -> float:
+    """What boxes and their absences say along the best path of a class, where it was measured, nats."""
+    total = 0.0
     for stage, state in zip(stages, posterior.path, strict=True):
         modes = sightings[stage.keyframe].modes[c]
         if modes is not None and state < len(modes):
-            total += modes.counts[state]
+            total += float(modes.witness[state])
     return total
 
 

@@ -129,7 +129,7 @@ def _counting(sighting: Sighting, times: float) -> Sighting:
             log_likelihood=times * modes.log_likelihood,
             depth_log_ratio=times * modes.depth_log_ratio,
             covariance=modes.covariance / times,
-            counts=times * modes.counts,
+            witness=times * modes.witness,
         )
 
     modes = tuple(more(m) for m in sighting.modes)

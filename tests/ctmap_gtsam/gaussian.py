@@ -53,7 +53,7 @@ class GaussianProposer:
             np.zeros(n),
             np.zeros(n),
             np.array([self.covariance[i] for i in there]).reshape(n, 6, 6),
-            np.zeros((n, 2)),
+            np.zeros(n),
         )
 
     def score(self, shape, view, T):
@@ -68,8 +68,8 @@ class GaussianProposer:
     def log_clutter(self, shape, view, T, first):
         return 0.0
 
-    def counts(self, shape, view, T):
-        return np.zeros(2)
+    def witness(self, shape, view, T):
+        return 0.0
 
 
 def in_sight(n):

@@ -165,25 +165,26 @@ def test_what_has_no_past_is_carried_by_the_prediction():
     np.testing.assert_allclose(steps.std(axis=0), np.repeat([0.01, 0.001], 3), rtol=0.08)
 
 
-def stage_of(k, evidence, other=-np.inf, clutter=0.0, counts=(30.0, 1.0), time_s=None, classes=None):
+def stage_of(k, evidence, other=-np.inf, clutter=0.0, witness=20.0, time_s=None, classes=None):
     time_ns = round((float(k) if time_s is None else time_s) * 1e9)
-    return Stage(k, time_ns, 0.8, classes or {}, np.array([evidence, other]), clutter, np.array(counts))
+    return Stage(k, time_ns, 0.8, classes or {}, np.array([evidence, other]), clutter, witness)
 
 
 def test_what_is_said_of_presence_and_class_is_all_stories_weighed_one_by_one():
     """There as a mug or a can until a stage and taken away then, there to the end, or never; or a double."""
     evidence = np.array([[3.0, 2.0], [9.0, 11.0], [14.0, 12.0], [8.0, 2.0], [-3.0, 1.0]])
     times = [0.0, 1.0, 2.0, 3.0, 100.0]
-    counts = np.array([[1.0, 0.0], [1.0, 1.5], [4.0, 1.5], [4.0, 3.0], [4.0, 6.0]])
+    witness = np.array([0.5, -1.0, 2.0, 1.0, -3.0])
     stages = [
-        stage_of(k, *e, clutter=2.0, counts=n, time_s=t)
-        for k, (e, n, t) in enumerate(zip(evidence, counts, times, strict=True))
+        stage_of(k, *e, clutter=2.0, witness=w, time_s=t)
+        for k, (e, w, t) in enumerate(zip(evidence, witness, times, strict=True))
     ]
     leave = np.full((4, 2), MODEL.config.prediction.jump_probability)
     leave[3] = [1.0 - MODEL.stay_probability(shape.source, 97.0) for shape in MODEL.shapes]
     stories = np.exp(evidence[:4]) * leave
     never = np.exp(2.0) * (1.0 - MODEL.config.detector.unfound) + 1.0
-    double = MODEL.config.detector.lookalike * np.exp(-MODEL.told(counts))
+    deceived = MODEL.config.detector.deceived
+    double = MODEL.config.detector.lookalike * ((1.0 - deceived) * np.exp(-witness) + deceived)
     never += double[:4] @ stories.sum(axis=1) + double[4] * np.exp(evidence[4]).sum()
     end = np.array([0.05, 0.15])
     last = last_there(end, leaving(stages, None, MODEL), stages, MODEL)
