@@ -76,7 +76,7 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
     for a, b, emission in zip(stages, stages[1:], emissions[1:], strict=False):
         between = _Between.of(a, b, model, shape, noise_variance)
         step = _transition(known, b, between, model, shape)
-        known = _update(known, b, between, forward[-1][:-1, None] + step.log_stay, shape)
+        known = _update(known, b, between, forward[-1], step, shape)
         steps.append(step)
         forward.append(log_sum(forward[-1][:, None] + step.log_total, axis=0) + emission)
     backward = [np.zeros(len(emissions[-1]))]
@@ -94,6 +94,8 @@ class _Step:
     """(n + 2, m + 2) log probability (density at modes) of each transition"""
     log_stay: Array
     """(n + 1, m + 1) the part of transitions among modes and unmeasured in which the object stayed"""
+    log_appear: float
+    """the other part of each transition to a mode, whatever was before: it came from elsewhere"""
 
 
 def _emission(stage: Stage, model: Model, shape: Shape) -> Array:
@@ -166,18 +168,22 @@ def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape:
     out[:, :m] = np.logaddexp(out[:, :m], appear)
     out[:n, m + 1] = leave
     out[n, m + 1] = np.log1p(-np.exp(leave))
-    return _Step(out, log_stay)
+    return _Step(out, log_stay, float(appear))
 
 
-def _update(known: _Known, b: Stage, between: _Between, log_joint: Array, shape: Shape) -> _Known:
-    """The best predecessor's knowledge, by Kalman's update with each mode of b, and carried on unmeasured."""
+def _update(known: _Known, b: Stage, between: _Between, forward: Array, step: _Step, shape: Shape) -> _Known:
+    """The best predecessor's knowledge, by Kalman's update with each mode of b, and carried on unmeasured.
+
+    A mode that the object more probably came to from elsewhere than stayed at knows itself and no past.
+    """
+    log_joint = forward[:-1, None] + step.log_stay
     best = np.argmax(log_joint, axis=0)
     T, covariance = known.T_world_centre[best], known.covariance[best]
     before = covariance[:-1] + between.sigma
     gain = before @ np.linalg.inv(before + b.covariance)
     r = symmetry.residual(T[:-1], b.T_world_centre, shape.symmetry)
     T_modes, updated = se3.retract(T[:-1], (gain @ r[..., None])[..., 0]), before - gain @ before
-    reached = np.isfinite(log_joint.max(axis=0))[:-1]
+    reached = log_joint.max(axis=0)[:-1] > log_sum(forward) + step.log_appear
     T_modes = np.where(reached[:, None, None], T_modes, b.T_world_centre)
     updated = np.where(reached[:, None, None], updated, b.covariance)
     carried = covariance[-1:] + between.walk

@@ -258,6 +258,25 @@ def test_what_is_seen_elsewhere_from_some_view_on_has_moved_there():
     np.testing.assert_allclose(posterior.moved, np.arange(9) == 4, atol=0.01)
 
 
+def test_what_was_known_before_a_move_says_nothing_of_the_new_place():
+    """The evidence is that of both places apart and of the move, however vague the views: here 3 m away, a day later."""
+    model = Model(classes("mug"), config_of("smoother.unmeasured=0.0"))
+    rng, day = np.random.default_rng(6), 86400.0
+    before, later = vague_track(rng, 5), vague_track(rng, 6)
+    away = se3.make(np.eye(3), np.array([3.0, 0.0, 0.0]))
+    after = [
+        replace(s, keyframe=5 + s.keyframe, time_s=day + s.time_s, T_world_centre=away @ s.T_world_centre)
+        for s in later
+    ]
+    whole = solve(before + after, model, MUG, STILL)
+    there = np.log(PRESENT_AT_FIRST)
+    gap = after[0].time_s - before[-1].time_s
+    move = np.log((1.0 - model.stay_probability(MUG.source, gap)) / 2.0)
+    apart = solve(before, model, MUG, STILL).log_evidence - there + solve(after, model, MUG, STILL).log_evidence + move
+    assert whole.log_evidence == pytest.approx(apart, abs=1e-3)
+    assert whole.moved[4] == pytest.approx(1.0)
+
+
 def test_a_view_without_modes_leaves_it_where_it_was():
     nothing = Stage(2, 2.0, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0))
     stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), nothing, at(3, 3.0, 0.0), at(4, 4.0, 0.0)]
