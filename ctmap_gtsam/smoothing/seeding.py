@@ -36,7 +36,7 @@ class Seed:
     believed: Mapping[int, Mapping[int, Array]]
     """class index -> keyframe -> (m, 4, 4) T_world_centre believed then, the heaviest first"""
     class_probability: Array
-    """(C,) at the end"""
+    """(C,) when it was last there"""
 
     @property
     def best_class(self) -> int:
@@ -93,7 +93,16 @@ def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
         poses[shape.index] = T[distinct(shape, T, -np.arange(len(rows), dtype=float), _ONE_POSE, _KEPT)]
         then = modes.keyframe[rows]
         believed[shape.index] = {int(k): T[then == k] for k in np.unique(then)}
-    return Seed(object_id, poses, believed, forward.class_probability[row, -1])
+    return Seed(object_id, poses, believed, forward.class_probability[row, _surest(forward.existence[row])])
+
+
+def _surest(existence: Array) -> int:
+    """The last of some keyframes at which an object was there, by its existence (K,); else the likeliest.
+
+    What a thing that is gone would be if it were there after all, is no class that it had.
+    """
+    there = np.flatnonzero(existence > EXISTS)
+    return int(there[-1]) if len(there) else int(np.argmax(existence))
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,7 @@ class Believed:
     poses: Mapping[int, Array]
     """class index -> (n, 4, 4) T_world_centre, the heaviest first"""
     class_probability: Array
-    """(C,)"""
+    """(C,) when it was last there"""
 
     @property
     def best_class(self) -> int:
@@ -125,7 +134,8 @@ def believed(forward: Estimate, model: Model, keyframe: int) -> dict[int, Believ
         for class_id in np.unique(modes.class_id[own]):
             shape = model.shapes[model.catalogue.index(int(class_id))]
             poses[shape.index] = shape.to_centre(modes.T_world_object[own[modes.class_id[own] == class_id]])
-        out[int(forward.object_id[row])] = Believed(poses, forward.class_probability[row, keyframe])
+        surest = _surest(forward.existence[row, : keyframe + 1])
+        out[int(forward.object_id[row])] = Believed(poses, forward.class_probability[row, surest])
     return dict(sorted(out.items()))
 
 

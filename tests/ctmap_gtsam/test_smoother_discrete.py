@@ -259,7 +259,7 @@ def test_what_is_seen_elsewhere_from_some_view_on_has_moved_there():
 
 
 def test_what_was_known_before_a_move_says_nothing_of_the_new_place():
-    """The evidence is that of both places apart and of the move, however vague the views: here 3 m away, a day later."""
+    """The evidence is that of both places apart and of the move, however vague the views: 3 m away, a day later."""
     model = Model(classes("mug"), config_of("smoother.unmeasured=0.0"))
     rng, day = np.random.default_rng(6), 86400.0
     before, later = vague_track(rng, 5), vague_track(rng, 6)
