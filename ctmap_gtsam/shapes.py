@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 _ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
 _ONE_FLAT_M = 0.01  # triangles of one flat lie so near to one plane ...
 _FLAT_SHARE = 0.02  # ... and make up this share of the surface together
+_ONE_PLACE = 0.5  # of the smaller thing's radius
 
 
 @dataclass(frozen=True)
@@ -178,3 +179,8 @@ def _face_normals(mesh: Mesh) -> Array:
     n = np.cross(b - a, c - a)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     return np.asarray(n / np.where(length == 0, 1.0, length))
+
+
+def one_place_m(a: Shape, b: Shape) -> float:
+    """How near to each other the centres of two things can't be, since both are solid, in metres."""
+    return _ONE_PLACE * min(a.radius_m, b.radius_m)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.frontend.observation import reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.shapes import Shape
+from ctmap_gtsam.shapes import Shape, one_place_m
 from factors.context import context_log_ratio, doubted, hinge_log_potential
 from sequences import se3
 from sequences.camera import Camera
@@ -47,7 +47,7 @@ class Neighbour:
         if apart > self.shape.reach_m + other.shape.reach_m:
             return False
         # two of one form in one pose touch everywhere and reach into each other nowhere
-        if apart < 0.5 * min(self.shape.radius_m, other.shape.radius_m):
+        if apart < one_place_m(self.shape, other.shape):
             return True
         T_own_other = (se3.inverse(self.T_world_centre) @ other.T_world_centre)[None]
         return bool(penetration_depth(self.shape, other.shape, T_own_other)[0] > _CONTENTION_M)

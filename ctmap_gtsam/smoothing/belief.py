@@ -21,6 +21,8 @@ POSSIBLE = 60.0
 """nats behind the best class beyond which a class is given up"""
 LIKELY = 15.0
 """nats behind the best class within which its modes are probed with care"""
+SURE = 0.8
+"""a class more probable than this is taken for granted by the neighbours"""
 
 _STAYED = 0.5
 
@@ -135,7 +137,7 @@ class Thing:
 
     def present_pose(self, keyframe: int) -> Array | None:
         """(4, 4) where it surely is at a keyframe; None where that isn't sure, or its class isn't."""
-        sure = self.exists and self.class_probability[self.best_class] > 0.8 and self.presence_at(keyframe) > 0.5
+        sure = self.exists and self.class_probability[self.best_class] > SURE and self.presence_at(keyframe) > 0.5
         pose = self.pose_near(self.best_class, keyframe) if sure else None
         return None if pose is None else pose[0]
 

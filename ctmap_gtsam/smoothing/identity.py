@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import one_place_m
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.modes import Recording
 
-_ONE_PLACE = 0.5  # of a thing's radius: solid things of one class can't have centres so near
 _SAME_CLASS = 0.5  # least P(both are of one class) for a join
 
 
@@ -42,7 +42,7 @@ def _same(a: Thing, b: Thing, model: Model) -> bool:
     if T_a is None or T_b is None:
         return False
     apart = np.linalg.norm(T_a[0, :3, 3] - T_b[0, :3, 3])
-    return bool(apart < _ONE_PLACE * model.shapes[a.best_class].radius_m)
+    return bool(apart < one_place_m(model.shapes[a.best_class], model.shapes[b.best_class]))
 
 
 def join_moved(things: Mapping[int, Thing], recording: Recording, model: Model) -> dict[int, Thing]:

@@ -28,6 +28,7 @@ from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import one_place_m
 from ctmap_gtsam.smoothing.association import Expected, assign
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera
@@ -42,8 +43,6 @@ from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
-
-_ONE_PLACE = 0.5  # of a thing's radius: an object that the filter takes for another one is believed so near to it
 
 
 def lagged_run(
@@ -199,7 +198,7 @@ class _Walk:
             if gone.thing is None or pose is None:
                 continue
             c = gone.thing.best_class
-            reach = _ONE_PLACE * self.model.shapes[c].radius_m
+            reach = one_place_m(self.model.shapes[c], self.model.shapes[c])
             for j, b in now.items():
                 there = j in self.objects and b.best_class == c
                 if there and np.linalg.norm(b.poses[c][0, :3, 3] - pose[0, :3, 3]) < reach:

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import EXISTS, Estimate
 from ctmap_gtsam.frontend.proposer import distinct
+from ctmap_gtsam.frontend.surroundings import Neighbour
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import one_place_m
+from ctmap_gtsam.smoothing.belief import SURE
 from factors.symmetry import near
 
 Array = NDArray[np.float64]
@@ -37,11 +40,31 @@ class Seed:
     """class index -> keyframe -> (m, 4, 4) T_world_centre believed then, the heaviest first"""
     class_probability: Array
     """(C,) when it was last there"""
+    there: NDArray[np.bool_]
+    """(K,) the keyframes at which it was believed to be there"""
+
+    @property
+    def surest(self) -> int:
+        """The last keyframe at which it was there."""
+        return int(np.flatnonzero(self.there)[-1]) if self.there.any() else len(self.there) - 1
 
     @property
     def best_class(self) -> int:
         """Index in the catalogue, of the most probable class that has a pose."""
         return most_probable(self.poses, self.class_probability)
+
+    def neighbour(self, keyframe: int, claim: float, model: Model) -> Neighbour | None:
+        """What others have beside them at a keyframe; None where it wasn't there, or its class wasn't sure.
+
+        Args:
+            keyframe: when.
+            claim: by which of two things in one place has it.
+            model: shapes.
+        """
+        c = self.best_class
+        if not self.there[keyframe] or self.class_probability[c] <= SURE:
+            return None
+        return Neighbour(self.object_id, model.shapes[c], self.expected(keyframe), claim)
 
     def expected(self, keyframe: int) -> Array:
         """(4, 4) T_world_centre of the best class at a keyframe."""
@@ -69,14 +92,32 @@ def careful(poses: Mapping[int, Array], probability: Array) -> frozenset[int]:
 
 
 def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
-    """The objects of an estimate that are still there at its end, or were taken away. By object id."""
-    out = {}
+    """The objects of an estimate, by object id.
+
+    Those that are still there at its end, or were taken away; and what was taken for another object in the end, or
+    given up, where no other object ever was: who is who is asked anew.
+    """
+    out, let_go = {}, []
     last = len(forward.keyframe_frame) - 1
     for row, object_id in enumerate(forward.object_id):
-        if forward.best_mode[row, last] < 0 or forward.existence[row].max() < _EVER:
-            continue
-        out[int(object_id)] = _seed(int(object_id), row, forward, model)
-    return out
+        if forward.best_mode[row, last] >= 0 and forward.existence[row].max() >= _EVER:
+            out[int(object_id)] = _seed(int(object_id), row, forward, model)
+        elif forward.existence[row].max() > EXISTS:
+            let_go.append(_seed(int(object_id), row, forward, model))
+    for seed in let_go:
+        if not any(_in_one_place(seed, other, model) for other in out.values()):
+            out[seed.object_id] = seed
+    return dict(sorted(out.items()))
+
+
+def _in_one_place(seed: Seed, other: Seed, model: Model) -> bool:
+    """Whether another object ever was where one was last."""
+    at = seed.expected(seed.surest)[:3, 3]
+    own = model.shapes[seed.best_class]
+    return any(
+        bool((np.linalg.norm(T[:, :3, 3] - at, axis=-1) < one_place_m(own, model.shapes[c])).any())
+        for c, T in other.poses.items()
+    )
 
 
 def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
@@ -93,7 +134,8 @@ def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
         poses[shape.index] = T[distinct(shape, T, -np.arange(len(rows), dtype=float), _ONE_POSE, _KEPT)]
         then = modes.keyframe[rows]
         believed[shape.index] = {int(k): T[then == k] for k in np.unique(then)}
-    return Seed(object_id, poses, believed, forward.class_probability[row, _surest(forward.existence[row])])
+    there = forward.existence[row] > EXISTS
+    return Seed(object_id, poses, believed, forward.class_probability[row, _surest(forward.existence[row])], there)
 
 
 def _surest(existence: Array) -> int:

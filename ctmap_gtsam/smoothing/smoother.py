@@ -168,7 +168,13 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
         return Wanted(seeds[i].starts(k), (seeds[i].best_class, seeds[i].expected(k)), probed)
 
     boxes = associate(recording, model, seeds, expected)
-    sightings = gather(recording, proposer, wanted, boxes, lambda _i, _k: (), progress, "round 1")
+
+    def neighbours(i: int, k: int) -> tuple[Neighbour, ...]:
+        # of two things in one place, the one with more boxes has it
+        there = (seed.neighbour(k, float(len(boxes[j])), model) for j, seed in seeds.items())
+        return Surroundings(tuple(n for n in there if n is not None), ()).without(i).neighbours
+
+    sightings = gather(recording, proposer, wanted, boxes, neighbours, progress, "round 1")
     return _solve(recording, model, boxes, sightings)
 
 

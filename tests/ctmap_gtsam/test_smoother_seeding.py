@@ -1,0 +1,78 @@
+"""Laws of what the smoother begins with: hypotheses of the forward pass, of what is there, was taken away or joined."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctmap_gtsam.building import Tables, build_estimate
+from ctmap_gtsam.model import Model
+from ctmap_gtsam.smoothing.seeding import believed, seeds
+from sequences import se3
+from tests.ctmap_gtsam.scenes import classes, config_of, small_run
+
+CONFIG = config_of()
+MODEL = Model(classes("mug", "bowl", "banana"), CONFIG)
+NAMES = [s.source.name for s in MODEL.shapes]
+HERE, THERE = (se3.make(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0))
+KEYFRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def run():
+    return replace(small_run()[0], catalogue=MODEL.catalogue)
+
+
+def forward(run, *stories):
+    """An estimate of things by their stories: (class, pose, existence) a keyframe; None where nothing is believed."""
+    tables = Tables(len(stories), KEYFRAMES, len(NAMES))
+    for row, story in enumerate(stories):
+        for k, said in enumerate(story):
+            if said is None:
+                continue
+            name, T, existence = said
+            c = NAMES.index(name)
+            tables.class_probability[row, k] = np.eye(len(NAMES))[c]
+            tables.existence[row, k] = existence
+            tables.mode(
+                row, k, MODEL.shapes[c].source.obj_id, 0.0, MODEL.shapes[c].to_object(T), np.eye(6), np.zeros((6, 0))
+            )
+    cameras = np.tile(np.eye(4), (KEYFRAMES, 1, 1))
+    covariance = np.zeros((KEYFRAMES, 6, 6))
+    keyframes = np.arange(KEYFRAMES, dtype=np.int64)
+    ids = [10 + row for row in range(len(stories))]
+    return build_estimate(run, CONFIG, "filter-ct", keyframes, ids, tables, cameras, covariance, {})
+
+
+def test_what_is_gone_has_the_class_and_pose_that_it_had(run):
+    """What it would be if it were there after all, hidden elsewhere, is no class that it had."""
+    gone = [("mug", HERE, 0.9)] * 3 + [("banana", THERE, 0.0)] * 3
+    seed = seeds(forward(run, gone), MODEL)[10]
+    assert NAMES[seed.best_class] == "mug"
+    for k in range(KEYFRAMES):
+        np.testing.assert_allclose(seed.expected(k), HERE, atol=1e-12)
+    now = believed(forward(run, gone), MODEL, KEYFRAMES - 1)[10]
+    assert now.class_probability[NAMES.index("mug")] == 1.0
+
+
+def test_a_class_found_late_is_the_class(run):
+    seed = seeds(forward(run, [("mug", HERE, 0.9)] * 3 + [("bowl", HERE, 0.9)] * 3), MODEL)[10]
+    assert NAMES[seed.best_class] == "bowl"
+
+
+def test_what_was_joined_is_asked_anew_where_nothing_else_ever_was(run):
+    joined = [("mug", HERE, 0.9)] * 3 + [None] * 3
+    apart = [None] * 3 + [("mug", THERE, 0.9)] * 3
+    twin = [("bowl", HERE, 0.9)] * KEYFRAMES
+    never = [("mug", HERE, 0.4)] * 3 + [None] * 3
+    assert sorted(seeds(forward(run, joined, apart), MODEL)) == [10, 11]
+    assert sorted(seeds(forward(run, joined, twin), MODEL)) == [11]
+    assert sorted(seeds(forward(run, never, apart), MODEL)) == [11]
+
+
+def test_neighbours_in_the_first_round_are_those_that_were_there_then(run):
+    seed = seeds(forward(run, [("mug", HERE, 0.9)] * 3 + [("mug", HERE, 0.1)] * 3), MODEL)[10]
+    for k in range(KEYFRAMES):
+        beside = seed.neighbour(k, 1.0, MODEL)
+        assert (beside is not None) == (k < 3)
+    assert seed.neighbour(0, 7.0, MODEL).log_evidence == 7.0
