@@ -7,6 +7,7 @@ past would be counted twice.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -95,19 +96,42 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
     """The objects of an estimate, by object id.
 
     Those that are still there at its end, or were taken away; and what was taken for another object in the end, or
-    given up, where no other object ever was: who is who is asked anew.
+    given up, where no other object ever was: who is who is asked anew. So is who came back: an object that is of one
+    class in a visit and of another in a later one may be two, and the second begins under an id of its own.
     """
-    out, let_go = {}, []
+    out: dict[int, Seed] = {}
+    let_go: list[Seed] = []
     last = len(forward.keyframe_frame) - 1
+    unused = itertools.count(int(forward.object_id.max(initial=-1)) + 1)
     for row, object_id in enumerate(forward.object_id):
         if forward.best_mode[row, last] >= 0 and forward.existence[row].max() >= _EVER:
-            out[int(object_id)] = _seed(int(object_id), row, forward, model)
+            for n, (first, end) in enumerate(_lives(row, forward)):
+                i = next(unused) if n else int(object_id)
+                out[i] = _seed(i, row, forward, model, first, end)
         elif forward.existence[row].max() > EXISTS:
-            let_go.append(_seed(int(object_id), row, forward, model))
+            let_go.append(_seed(int(object_id), row, forward, model, 0, last + 1))
     for seed in let_go:
         if not any(_in_one_place(seed, other, model) for other in out.values()):
             out[seed.object_id] = seed
     return dict(sorted(out.items()))
+
+
+def _lives(row: int, forward: Estimate) -> list[tuple[int, int]]:
+    """Keyframes, from the first to before the second, in which an object of the forward pass was of one class.
+
+    Within a visit it is the same thing, and what is believed of it at the visit's end is what it was.
+    """
+    begun, before = [0], None
+    for visit in np.unique(forward.keyframe_visit):
+        own = np.flatnonzero(forward.keyframe_visit == visit)
+        there = own[forward.existence[row, own] > EXISTS]
+        if not len(there) or forward.class_probability[row, there[-1]].max() <= SURE:
+            continue
+        c = int(np.argmax(forward.class_probability[row, there[-1]]))
+        if before is not None and c != before:
+            begun.append(int(own[0]))
+        before = c
+    return list(itertools.pairwise([*begun, len(forward.keyframe_frame)]))
 
 
 def _in_one_place(seed: Seed, other: Seed, model: Model) -> bool:
@@ -120,9 +144,10 @@ def _in_one_place(seed: Seed, other: Seed, model: Model) -> bool:
     )
 
 
-def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
+def _seed(object_id: int, row: int, forward: Estimate, model: Model, first: int, end: int) -> Seed:
+    """What was believed of an object at the keyframes from the first to before the end."""
     modes = forward.modes
-    own = np.flatnonzero(modes.object == row)
+    own = np.flatnonzero((modes.object == row) & (modes.keyframe >= first) & (modes.keyframe < end))
     # what is believed of a thing that is gone says little of where it was; of the rest the later knows more
     gone = forward.existence[row, modes.keyframe[own]] <= EXISTS
     own = own[np.lexsort((-modes.log_weight[own], -modes.keyframe[own], gone))]
@@ -134,8 +159,10 @@ def _seed(object_id: int, row: int, forward: Estimate, model: Model) -> Seed:
         poses[shape.index] = T[distinct(shape, T, -np.arange(len(rows), dtype=float), _ONE_POSE, _KEPT)]
         then = modes.keyframe[rows]
         believed[shape.index] = {int(k): T[then == k] for k in np.unique(then)}
-    there = forward.existence[row] > EXISTS
-    return Seed(object_id, poses, believed, forward.class_probability[row, _surest(forward.existence[row])], there)
+    keyframes = np.arange(len(forward.keyframe_frame))
+    there = (forward.existence[row] > EXISTS) & (first <= keyframes) & (keyframes < end)
+    surest = first + _surest(forward.existence[row, first:end])
+    return Seed(object_id, poses, believed, forward.class_probability[row, surest], there)
 
 
 def _surest(existence: Array) -> int:
