@@ -2,8 +2,8 @@
 
 A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera:
 the overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track.
-A new track counts only after `start_after` frames with a box, none more than `lost_after_s` after the one before: half of the
-boxes of what is half hidden are missing, and three in a row may never come.
+A new track counts only after `start_after` frames with a box, none more than `lost_after_s` after the one before: of
+what is half hidden half of the boxes are missing, and three in a row may never come.
 
 What the image's edge cuts has boxes that can't be predicted so, tables and shelves above all. A box that overlaps no
 prediction is also met where the detector calls it the same and it lies within half that class's diameter of the track.
