@@ -402,7 +402,8 @@ class Updater:
         awake = (behind > -bound) | (search and belief.steps // _WAKE_EVERY > belief.searched // _WAKE_EVERY)
         efforts = np.full(len(evidence), self.model.config.filter.search_share if search else 0.0)
         named = self._named(belief)
-        if named != best and view.detection is not None:
+        lost = depth is None or depth.log_evidence < belief.log_clutter
+        if view.detection is not None and (named != best or lost):
             awake[named], efforts[named] = True, 1.0
         standard = self._standard(belief, best) if efforts.any() else None
         stepped = {}
@@ -417,7 +418,10 @@ class Updater:
         return tuple(stepped[c] if awake[c] else own for c, own in enumerate(asleep))
 
     def _named(self, belief: Belief) -> int:
-        """The class that the detector has named so far: where depth says another, its pose may not have been found."""
+        """The class that the detector has named so far.
+
+        Where depth says another, or nothing that clutter wouldn't, its pose may not have been found.
+        """
         return int(np.argmax(belief.score_evidence + self.model.class_evidence(belief.score_sum)))
 
     def _standard(self, belief: Belief, best: int) -> _Standard | None:

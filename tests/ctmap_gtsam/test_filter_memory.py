@@ -105,3 +105,16 @@ def test_what_the_detector_names_is_searched_for_without_waiting_and_what_it_doe
     # one that was named another thing so far
     others = replace(belief, score_sum=np.where(np.arange(3) == MUG.index, -50.0, 0.0))
     assert np.argmax(after(updater, others, 0.1).class_log_evidence(seldom)) != MUG.index
+
+
+def test_what_explains_less_than_clutter_would_is_searched_for_in_every_view():
+    seldom = model_of("mug", "soup_can", "cereal_box", config=config_of(*CHEAP, "filter.search_every=1000"))
+    updater, belief = mug_lost(seldom)
+    alone = replace(belief, classes=tuple(own if c == MUG.index else None for c, own in enumerate(belief.classes)))
+    evidence, scored = alone.classes[MUG.index].log_evidence, []
+    for clutter in (evidence - 1e6, evidence + 1e6):
+        before = updater.proposer.hypotheses_scored
+        after(updater, replace(alone, log_clutter=clutter), 0.8)
+        scored.append(updater.proposer.hypotheses_scored - before)
+    searches = 4 * seldom.config.frontend.fresh_poses
+    assert scored[1] > scored[0] + searches
