@@ -66,7 +66,9 @@ def moved_to(
     if not gone or not there:
         return {}
     movable = np.array([shape.source.movable for shape in model.shapes])
-    same = np.array([[_one_class(beliefs[a], reports[a], beliefs[b], reports[b], movable) for b in there] for a in gone])
+    same = np.array(
+        [[_one_class(beliefs[a], reports[a], beliefs[b], reports[b], movable) for b in there] for a in gone]
+    )
     rows, columns = linear_sum_assignment(-same)
     return {
         gone[r]: (there[c], float(same[r, c])) for r, c in zip(rows, columns, strict=True) if same[r, c] >= _SAME_CLASS
