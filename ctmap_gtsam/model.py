@@ -17,7 +17,6 @@ from factors.measurement import (
     box_log_ratio,
     class_log_ratio,
     confusion,
-    detection_log_ratio,
     persistent_class_log_evidence,
 )
 from factors.persistence import stay_probability
@@ -139,10 +138,13 @@ class Model:
 
     def detection(self, visible: Array, box_log_ratios: Array | None) -> Array:
         """log of the detection potential (K,) for visible shares (K,): with its track's box (K,), or missed (None)."""
-        p = self.config.detector.detection_probability
+        d = self.config.detector
+        seen = d.detection_probability * visible
         if box_log_ratios is None:
-            return np.log1p(-p * visible)
-        return detection_log_ratio(p, visible, box_log_ratios[:, None], np.zeros((len(visible), 1)))
+            return np.log1p(-seen)
+        # that the track's own box came from elsewhere is as rare for what hides as for what shows
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log(d.box_outlier) + np.log1p(-seen), np.log(seen) + box_log_ratios)
 
     def class_scores(self, detection: Detection) -> Array:
         """(C,) log p(s | d) / p(s | clutter) of a score vector for each class d that the detector may believe in."""

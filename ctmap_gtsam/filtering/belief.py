@@ -107,8 +107,10 @@ class _Effort:
     particles: int
     likely: bool
     """near enough to the best class to be looked at closely"""
+    search: float
+    """effort of a fresh search, as a share of the first one's; 0 = none"""
     standard: _Standard | None
-    """where it is searched for afresh, beside what is believed: what new poses are held to"""
+    """what the poses that a search finds are held to, beside what is believed"""
 
 
 @dataclass(frozen=True)
@@ -398,10 +400,15 @@ class Updater:
         bound = max(least, share * (0.0 if depth is None else depth.log_evidence))
         # what wakes is searched for: it may be behind because nobody found it
         awake = (behind > -bound) | (search and belief.steps // _WAKE_EVERY > belief.searched // _WAKE_EVERY)
-        standard = self._standard(belief, best) if search else None
+        efforts = np.full(len(evidence), self.model.config.filter.search_share if search else 0.0)
+        named = self._named(belief)
+        lost = depth is None or depth.log_evidence < belief.log_clutter
+        if view.detection is not None and (named != best or lost):
+            awake[named], efforts[named] = True, 1.0
+        standard = self._standard(belief, best) if efforts.any() else None
         stepped = {}
         for c in np.flatnonzero(awake):
-            effort = _Effort(int(counts[c]), likely=bool(behind[c] > -_LIKELY), standard=standard)
+            effort = _Effort(int(counts[c]), bool(behind[c] > -_LIKELY), float(efforts[c]), standard)
             stepped[int(c)] = self._step_class(belief, self.model.shapes[c], view, observation, around, effort)
         after = stepped[best]
         gained = after.log_evidence - depth.log_evidence if depth is not None and after is not None else 0.0
@@ -409,6 +416,13 @@ class Updater:
             None if own is None else replace(own, log_evidence=own.log_evidence + gained) for own in belief.classes
         )
         return tuple(stepped[c] if awake[c] else own for c, own in enumerate(asleep))
+
+    def _named(self, belief: Belief) -> int:
+        """The class that the detector has named so far.
+
+        Where depth says another, or nothing that clutter wouldn't, its pose may not have been found.
+        """
+        return int(np.argmax(belief.score_evidence + self.model.class_evidence(belief.score_sum)))
 
     def _standard(self, belief: Belief, best: int) -> _Standard | None:
         own = belief.classes[best]
@@ -440,12 +454,12 @@ class Updater:
         starts = np.zeros((0, 4, 4))
         if own is not None:
             starts = observation.frame.T_camera_world @ own.particles.best(3)
-        if effort.standard is not None:
-            found = self.proposer.search(shape, view, observation, around, rng, self.model.config.filter.search_share)
+        if effort.search > 0.0:
+            found = self.proposer.search(shape, view, observation, around, rng, effort.search)
             starts = np.concatenate([starts, found])
         modes = self.proposer.modes(shape, view, starts, probe=effort.likely)
         proposals = self._in_world(modes, observation)
-        if effort.standard is not None and proposals is not None:
+        if effort.search > 0.0 and effort.standard is not None and proposals is not None:
             own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
         spread = self._spread(observation, belief.time_ns, starts)
         stepped = self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)

@@ -203,7 +203,7 @@ class Forward:
 
     def _find_moved(self, reported: dict[int, Reported]) -> dict[int, Reported]:
         """Objects whose place was found empty and that are met elsewhere go on there."""
-        moved = moved_to(self.beliefs, reported, self.surest)
+        moved = moved_to(self.beliefs, reported, self.surest, self.model)
         for i, (found, same) in moved.items():
             between = self.beliefs[i].present_ns, self.beliefs[found].first_ns
             self.found_moved.append((i, between, same))

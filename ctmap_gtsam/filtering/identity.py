@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from ctmap_gtsam.filtering.belief import Belief, Reported
@@ -21,7 +22,7 @@ from factors import mixture
 _ONE_PLACE = 0.5  # of the smaller thing's radius: solid things can't have centres so near
 _SAME_CLASS = 0.5  # least P(both are of one class) for a join
 _WAS_THERE = 0.8  # an object that never existed with this probability can't have moved
-_FORGOTTEN = -30.0  # nats: what an object is known not to be stays possible by this much
+_MISTAKEN = 0.1  # of the objects that seem to be found again, so many are others of like class
 
 
 def at_place(track_report: Reported, objects: Mapping[int, Reported], model: Model) -> int | None:
@@ -47,7 +48,7 @@ def twin(report: Reported, objects: Mapping[int, Reported], model: Model) -> int
 
 
 def moved_to(
-    beliefs: Mapping[int, Belief], reports: Mapping[int, Reported], surest: Mapping[int, float]
+    beliefs: Mapping[int, Belief], reports: Mapping[int, Reported], surest: Mapping[int, float], model: Model
 ) -> dict[int, tuple[int, float]]:
     """Which objects were found again as others, by a global assignment.
 
@@ -55,6 +56,7 @@ def moved_to(
         beliefs: of every object.
         reports: of this keyframe.
         surest: the largest existence that each object ever had.
+        model: tells what can be moved.
 
     Returns:
         Object -> the object that it is now, and P(both are of one class).
@@ -63,23 +65,29 @@ def moved_to(
     there = [i for i in sorted(reports) if reports[i].existence > _WAS_THERE]
     if not gone or not there:
         return {}
-    same = np.array([[_one_class(beliefs[a], reports[a], beliefs[b], reports[b]) for b in there] for a in gone])
+    movable = np.array([shape.source.movable for shape in model.shapes])
+    same = np.array(
+        [[_one_class(beliefs[a], reports[a], beliefs[b], reports[b], movable) for b in there] for a in gone]
+    )
     rows, columns = linear_sum_assignment(-same)
     return {
         gone[r]: (there[c], float(same[r, c])) for r, c in zip(rows, columns, strict=True) if same[r, c] >= _SAME_CLASS
     }
 
 
-def _one_class(gone: Belief, gone_report: Reported, found: Belief, found_report: Reported) -> float:
-    """P(one class) where the second began after the first was last seen at its place, else 0."""
+def _one_class(
+    gone: Belief, gone_report: Reported, found: Belief, found_report: Reported, movable: NDArray[np.bool_]
+) -> float:
+    """P(one class that can be moved) where the second began after the first was last seen at its place, else 0."""
     if found.first_ns <= gone.present_ns:
         return 0.0
-    return float(gone_report.class_probability @ found_report.class_probability)
+    return float((gone_report.class_probability * found_report.class_probability)[movable].sum())
 
 
 def as_moved(old: Belief, found: Belief, model: Model) -> Belief:
     """The belief of an object at its new place: what was known of its class is still known."""
-    known = np.maximum(mixture.normalised(old.class_log_evidence(model)), _FORGOTTEN) + np.log(len(old.classes))
+    known = mixture.normalised(old.class_log_evidence(model)) + np.log(len(old.classes))
+    known = np.logaddexp(np.log1p(-_MISTAKEN) + known, np.log(_MISTAKEN))
     return replace(
         found,
         object_id=old.object_id,

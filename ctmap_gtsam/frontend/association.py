@@ -2,7 +2,8 @@
 
 A track remembers where in the world the centre of its last box was, so that its box is predicted for any later camera:
 the overlap is with the predicted box. Thus a thing that left the view and was not moved is met again on its own track.
-A new track counts only after `start_after` consistent frames.
+A new track counts only after `start_after` frames with a box, none more than `lost_after_s` after the one before: of
+what is half hidden half of the boxes are missing, and three in a row may never come.
 
 What the image's edge cuts has boxes that can't be predicted so, tables and shelves above all. A box that overlaps no
 prediction is also met where the detector calls it the same and it lies within half that class's diameter of the track.
@@ -56,7 +57,6 @@ class _Open:
     box: Array
     z: float
     last_ns: int
-    streak: int
     score_sum: Array
     """(C,) class scores, background left out, each vector of sum 1"""
     keyframes: list[int] = field(default_factory=list)
@@ -127,18 +127,16 @@ class Associator:
         track.score_sum = track.score_sum + _class_shares(detection)
         track.keyframes.append(observation.keyframe)
         track.detections.append(detection)
-        track.streak += 1
-        if track.started is None and track.streak >= self._settings.start_after:
+        if track.started is None and len(track.keyframes) >= self._settings.start_after:
             track.started = observation.keyframe
 
     def _age(self, frame: Frame, matched: set[int]) -> None:
-        """Tracks that were not met: one that has not started must be consistent, and is given up when it was not."""
+        """Tracks that were not met: one that has not started is given up after a while."""
         lost = set()
         for i in self._live:
             track = self._tracks[i]
             if i in matched or track.started is not None:
                 continue
-            track.streak = 0
             if frame.time_ns - track.last_ns > self._settings.lost_after_s * 1e9:
                 lost.add(i)
         self._live = [i for i in self._live if i not in lost]
@@ -146,7 +144,7 @@ class Associator:
     def _open(self, observation: Observation, detection: Detection, point: Array | None) -> None:
         assert point is not None
         nothing = np.zeros(len(self._reach_m))
-        track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, 0, nothing)
+        track = _Open(point, np.array(detection.box), 0.0, observation.frame.time_ns, nothing)
         self._live.append(len(self._tracks))
         self._tracks.append(track)
         self._extend(track, observation, detection, point)

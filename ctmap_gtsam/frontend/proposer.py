@@ -43,6 +43,7 @@ _LITTLE, _FURNITURE = 0.25, 6.0  # effort for a class of the wrong size, and for
 _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _RIPPLE = 2.0  # a width so many times that of the score's first fall is the score's, the first fall a ripple
+_BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -135,6 +136,8 @@ class Proposer:
         tile = cut_tile(camera, observation.depth, observation.planes_behind(box), region, by * step)
         if surroundings is not None:
             tile = surroundings.behind(surroundings.beneath(tile, observation.frame, box), observation.frame)
+        if detection is not None:
+            tile = bounded(tile, box)
         return View(tile, detection, (camera.width, camera.height), z, share, by**2)
 
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
@@ -259,8 +262,9 @@ class Proposer:
             through = measured & (z > rendered + sensor.occlusion_margin_m)
             empty = float(max(2 * int(through.sum()) - int(measured.sum()), 0))
             return view.share * (boxes - sample * empty)
+        # what stands before the pose within the box is explained, too: it is the surface of the thing itself
         surprising = (background == 0) | (z < background - sensor.occlusion_margin_m)
-        return view.share * (boxes + sample * float((seen & surprising).sum()))
+        return view.share * (boxes + sample * float((measured & surprising).sum()))
 
     def _draw(
         self,
@@ -435,6 +439,20 @@ def _centre_region(box: Array, image_size: tuple[int, int], nearness: float) -> 
     low = np.where(box[:2] <= _EDGE_PX, -size / 2, low)
     high = np.where(box[:2] + size >= image - _EDGE_PX, image + size / 2, high)
     return low, high
+
+
+def bounded(tile: Tile, box: Array) -> Tile:
+    """The tile of a thing with a detected box (x, y, w, h): what is seen outside of the box is other things' surface.
+
+    It is background there, so that no pose gains by explaining it.
+    """
+    margin = _BOX_SLACK * box[2:]
+    low, high = box[:2] - margin, box[:2] + box[2:] + margin
+    height, width = tile.depth.shape
+    u, v = tile.x + tile.step * np.arange(width), tile.y + tile.step * np.arange(height)
+    inside = ((v >= low[1]) & (v <= high[1]))[:, None] & ((u >= low[0]) & (u <= high[0]))
+    nearer = (tile.depth > 0) & ((tile.background == 0) | (tile.depth < tile.background))
+    return replace(tile, background=np.where(~inside & nearer, tile.depth, tile.background))
 
 
 def _widths(drop: Array) -> Array:

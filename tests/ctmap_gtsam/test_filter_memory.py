@@ -63,22 +63,58 @@ def test_the_true_pose_explains_all_views_and_one_elsewhere_none():
     assert Memory().log_likelihood(proposer, MUG, TRUTH, reach) == 0.0
 
 
-def test_a_class_that_was_not_found_at_first_is_believed_once_it_is():
-    """Its evidence is that of all views, not of those since it was found."""
-    updater = Updater(MODEL, Proposer(MODEL), LocalisationNoise())
+def mug_lost(model):
+    """An updater, and a belief whose particles of the mug, which it is, are all in a wrong place."""
+    updater = Updater(model, Proposer(model), LocalisationNoise())
     first = seen(0)
     track = Track(0, (0,), (first.frame.detections[0],), 0)
     belief = updater.start(track, first, ALONE, updater.search(track, first, ALONE))
-    assert np.argmax(belief.class_log_evidence(MODEL)) == MUG.index
+    assert np.argmax(belief.class_log_evidence(model)) == MUG.index
     far_off = se3.make(TRUTH[:3, :3], TRUTH[:3, 3] + [0.0, 0.0, 0.08])
     lost = ClassBelief(Particles(np.tile(far_off, (24, 1, 1)), np.full(24, -np.log(24.0))), -200.0)
     classes = tuple(lost if c == MUG.index else own for c, own in enumerate(belief.classes))
     # a class so far behind sleeps most of the time
-    belief = replace(belief, classes=classes, steps=14, searched=13)
-    assert np.argmax(belief.class_log_evidence(MODEL)) != MUG.index
+    return updater, replace(belief, classes=classes, steps=14, searched=13)
+
+
+def after(updater, belief, score):
+    """The belief after four views more, in which the detector gives the mug a score."""
     for k in range(1, 5):
         observation = seen(k)
-        belief = updater.step(belief, observation.frame.detections[0], observation, ALONE)
+        scores = np.full(4, (1.0 - score) / 3.0)
+        scores[1 + MUG.index] = score
+        detection = replace(observation.frame.detections[0], class_scores=scores)
+        belief = updater.step(belief, detection, observation, ALONE)
+    return belief
+
+
+def test_a_class_that_was_not_found_at_first_is_believed_once_it_is():
+    """Its evidence is that of all views, not of those since it was found."""
+    updater, belief = mug_lost(MODEL)
+    assert np.argmax(belief.class_log_evidence(MODEL)) != MUG.index
+    belief = after(updater, belief, 0.8)
     assert np.argmax(belief.class_log_evidence(MODEL)) == MUG.index
     own = belief.classes[MUG.index]
     assert np.linalg.norm(own.particles.best(1)[0, :3, 3] - TRUTH[:3, 3]) < 0.01
+
+
+def test_what_the_detector_names_is_searched_for_without_waiting_and_what_it_does_not_is_not():
+    seldom = model_of("mug", "soup_can", "cereal_box", config=config_of(*CHEAP, "filter.search_every=1000"))
+    updater, belief = mug_lost(seldom)
+    assert np.argmax(after(updater, belief, 0.8).class_log_evidence(seldom)) == MUG.index
+    # one that was named another thing so far
+    others = replace(belief, score_sum=np.where(np.arange(3) == MUG.index, -50.0, 0.0))
+    assert np.argmax(after(updater, others, 0.1).class_log_evidence(seldom)) != MUG.index
+
+
+def test_what_explains_less_than_clutter_would_is_searched_for_in_every_view():
+    seldom = model_of("mug", "soup_can", "cereal_box", config=config_of(*CHEAP, "filter.search_every=1000"))
+    updater, belief = mug_lost(seldom)
+    alone = replace(belief, classes=tuple(own if c == MUG.index else None for c, own in enumerate(belief.classes)))
+    evidence, scored = alone.classes[MUG.index].log_evidence, []
+    for clutter in (evidence - 1e6, evidence + 1e6):
+        before = updater.proposer.hypotheses_scored
+        after(updater, replace(alone, log_clutter=clutter), 0.8)
+        scored.append(updater.proposer.hypotheses_scored - before)
+    searches = 4 * seldom.config.frontend.fresh_poses
+    assert scored[1] > scored[0] + searches

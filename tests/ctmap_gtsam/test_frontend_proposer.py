@@ -215,6 +215,43 @@ def test_leaving_ones_box_is_never_rewarded():
     assert with_box[0] > missed[0]
 
 
+def test_a_box_bounds_what_a_pose_may_gain_by_explaining_other_things():
+    """With a soup can beside a mug: the mug's box says of the mug what it said, of the can next to nothing."""
+    mug, other = shape_named(MODEL, "mug"), shape_named(MODEL, "soup_can")
+    camera = looking(0.0, 0.65, 0.7)
+    poses = [(mug, standing(mug)), (other, standing(other, 0.11, 0.0))]
+    observation = view_of(MODEL, poses, camera)
+    detection = observation.frame.detections[0]
+    proposer = Proposer(MODEL)
+    view = proposer.view(observation, np.array(detection.box), detection)
+    T = [se3.inverse(camera) @ pose for _, pose in poses]
+    for shape, pose, mine in ((mug, T[0], True), (other, T[1], False)):
+        bounded_ = proposer.score(shape, view, pose[None])[1]
+        free = proposer.score(shape, replace(view, tile=_unbounded(proposer, observation, detection)), pose[None])[1]
+        assert bounded_.covered[0] == free.covered[0] > 20
+        if mine:
+            assert bounded_.log_ratio[0] == pytest.approx(free.log_ratio[0], rel=0.02)
+        else:
+            assert free.log_ratio[0] > free.covered[0]
+            assert bounded_.log_ratio[0] < 0.1 * free.log_ratio[0]
+
+
+def _unbounded(proposer, observation, detection):
+    """The tile of a box that nobody detected."""
+    return proposer.view(observation, np.array(detection.box), None).tile
+
+
+def test_clutter_explains_what_stands_before_a_pose_as_well():
+    """A pose behind the surface that is seen gains nothing over clutter by calling that surface an occluder."""
+    proposer, shape, view, _, T = scene("cereal_box")
+    behind = se3.make(np.eye(3), np.array([0.0, 0.0, 0.15])) @ T
+    mine, hidden = (proposer.log_clutter(shape, view, pose, first=True) for pose in (T, behind))
+    assert hidden > 0.5 * mine
+    own, _ = proposer.score(shape, view, np.stack([T, behind]))
+    assert own[0] > mine
+    assert own[1] < hidden
+
+
 def test_the_same_draws_give_the_same_search_and_other_draws_another():
     proposer, shape, view, observation, _ = scene("mug")
     a, b, c = (

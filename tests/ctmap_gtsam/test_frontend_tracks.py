@@ -99,11 +99,13 @@ def test_a_track_starts_when_it_was_consistent_for_so_many_frames(after):
         assert all(t.started == after - 1 for t in tracks)
 
 
-def test_an_interrupted_streak_begins_anew():
-    spots = [[SPOTS[0]], [SPOTS[0]], [], [SPOTS[0]], [SPOTS[0]], [SPOTS[0]]]
-    observations = [seen(k, T, s) for k, (T, s) in enumerate(zip(cameras(6), spots, strict=True))]
-    assert tracks_of(observations[:5]) == ()
-    assert tracks_of(observations)[0].started == 5
+@pytest.mark.parametrize("missed", [0, 1, 4, 5])
+def test_a_track_that_has_not_started_outlives_misses_but_not_a_long_absence(missed):
+    """Half a second between frames: at the fifth miss the last box is more than two seconds ago."""
+    spots = [[SPOTS[0]], [SPOTS[0]], *([[]] * missed), [SPOTS[0]]]
+    observations = [seen(k, T, s) for k, (T, s) in enumerate(zip(cameras(len(spots)), spots, strict=True))]
+    tracks = tracks_of(observations)
+    assert [t.started for t in tracks] == ([] if missed == 5 else [len(spots) - 1])
 
 
 def test_a_thing_that_left_the_view_is_met_again_on_its_own_track():

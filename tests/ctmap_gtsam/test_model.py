@@ -93,3 +93,16 @@ def test_what_views_share_grows_with_distance_by_the_cameras_turn_alone(rotation
     still = MODEL.shared_variance(LocalisationNoise(0.0, 0.0), away)
     sensor = MODEL.config.sensor
     np.testing.assert_allclose(still, np.repeat([sensor.bias_rotation_rad, sensor.bias_translation_m], 3) ** 2)
+
+
+@given(st.floats(-20.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_a_box_of_its_own_does_not_speak_for_what_hides(fit, some, more):
+    """A track's box came from elsewhere as rarely when its thing is hidden as when it shows."""
+    outlier = MODEL.config.detector.box_outlier
+    hidden, seen = (float(MODEL.detection(np.array([v]), np.array([fit]))[0]) for v in (0.0, more))
+    assert hidden == pytest.approx(np.log(outlier))
+    assert min(np.log(outlier), fit) - 0.11 <= seen <= max(np.log(outlier), fit) + 1e-9
+    less, no_less = (MODEL.detection(np.array([v]), np.array([fit]))[0] for v in sorted((some, more)))
+    assert (no_less >= less - 1e-9) == (fit >= np.log(outlier) - 1e-9) or less == pytest.approx(no_less)
+    # and without a box being hidden says nothing
+    assert MODEL.detection(np.array([0.0]), None)[0] == 0.0
