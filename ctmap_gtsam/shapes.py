@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations, product
 
 import numpy as np
 import trimesh
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from trimesh.poses import compute_stable_poses
 
-from factors.symmetry import Symmetry
+from factors.symmetry import Symmetry, residual
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh, ObjectClass
-from sequences.distance import DistanceField, distance_field
+from sequences.distance import DistanceField, distance_field, spread
 from sequences.meshes import simplify
 
 Array = NDArray[np.float64]
@@ -28,6 +29,10 @@ _ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
 _ONE_FLAT_M = 0.01  # triangles of one flat lie so near to one plane ...
 _FLAT_SHARE = 0.02  # ... and make up this share of the surface together
 _ONE_PLACE = 0.5  # of the smaller thing's radius
+_TWIN = 0.05  # a turn that moves the surface off itself by less than this share of the radius is a near-symmetry ...
+_TWINS = 3  # ... of which so many are told at most
+_SAME_RAD = 0.1  # turns so near to each other are one
+_TWIN_POINTS = 1000
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,25 @@ class Shape:
         """Signed distance field in the centre frame."""
         return distance_field(self.mesh)
 
+    @cached_property
+    def twins(self) -> Array:
+        """(n, 3, 3) near-symmetries: turns about the centre after which the mesh looks nearly, but not just, as before.
+
+        Of the 24 turns that carry the frame's axes into each other, those after which the surface's mean distance from
+        itself is least; most meshes that have near-symmetries have their axes along the frame's.
+        """
+        points = spread(self.mesh)
+        points = points[:: -(-len(points) // _TWIN_POINTS)]
+        off = np.array([np.abs(self.distance.at(points @ R.T)).mean() for R in _TURNS]) / self.radius_m
+        kept: list[Array] = [np.eye(3)]
+        for k in np.argsort(off, kind="stable"):
+            T = se3.make(_TURNS[k], np.zeros(3))
+            there = se3.make(np.stack(kept), np.zeros((len(kept), 3)))
+            apart = np.linalg.norm(residual(there, T, self.symmetry)[..., :3], axis=-1).min()
+            if off[k] < _TWIN and apart > _SAME_RAD and len(kept) <= _TWINS:
+                kept.append(_TURNS[k])
+        return np.stack(kept)[1:]
+
     def surface_points(self, n: int) -> Array:
         """(<= n, 3) middles of faces spread over the surface, centre frame."""
         return np.ascontiguousarray(self._middles[:: max(1, -(-len(self._middles) // n))])
@@ -135,6 +159,15 @@ class Shape:
         if free.shape[-1] == 0:
             return free
         return np.asarray(np.linalg.qr(se3.adjoint(self.T_object_centre) @ free)[0])
+
+
+def _turns() -> Array:
+    """(24, 3, 3) rotations that carry the axes into each other."""
+    signed = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
+    return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
+
+
+_TURNS = _turns()
 
 
 def build_shapes(catalogue: Catalogue, faces: int) -> tuple[Shape, ...]:

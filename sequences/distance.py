@@ -56,13 +56,13 @@ def distance_field(mesh: Mesh, nodes: int = 32) -> DistanceField:
     origin = (low + high) / 2 - spacing * (count - 1) / 2
     axes = [origin[i] + spacing * np.arange(count[i]) for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance = cKDTree(_spread(mesh)).query(points)[0]
+    distance = cKDTree(spread(mesh)).query(points)[0]
     inside = np.abs(_winding(points, mesh.vertices, mesh.faces)) > 0.5
     signed = np.where(inside, -distance, distance).astype(np.float32)
     return DistanceField(origin, spacing, signed.reshape(count))
 
 
-def _spread(mesh: Mesh) -> Array:
+def spread(mesh: Mesh) -> Array:
     """Points (n, 3) all over the surface, every face at a density of its area: a lattice of barycentric coordinates."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)

@@ -44,6 +44,7 @@ _EDGE_PX = 3.0  # a box so near to the image's edge may be cut by it
 _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth that is seen, at most
 _RIPPLE = 2.0  # a width so many times that of the score's first fall is the score's, the first fall a ripple
 _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
+_ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -191,7 +192,9 @@ class Proposer:
         around = self._refine(shape, view, starts, self._coarse(shape)[self._coarse_steps // 2 :])
         return np.concatenate([coarse, around])
 
-    def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True) -> PoseModes:
+    def modes(
+        self, shape: Shape, view: View, starts: Array, probe: bool = True, near_symmetries: bool = False
+    ) -> PoseModes:
         """Refine starts (K, 4, 4) T_camera_centre, score, merge equal ones and keep the best few.
 
         Args:
@@ -200,16 +203,21 @@ class Proposer:
             starts: (K, 4, 4) T_camera_centre.
             probe: whether to climb along the axes on the score, and to take covariances from its shape (else from the
                 registration's normal equations).
+            near_symmetries: whether the best is tried as turned by each of the class's near-symmetries, too, and the
+                best of each is kept: all views decide which way round it stands, not which ways were tried.
         """
         if len(starts) == 0:
             return _no_modes()
+        twins = shape.twins if near_symmetries else np.zeros((0, 3, 3))
+        if len(twins):
+            starts = np.concatenate([starts, self._turned(shape, view, starts, twins)])
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
-        keep = self._distinct(shape, candidates, score)
+        keep = self._distinct(shape, candidates, score, twins)
         if probe and view.detection is not None:
             candidates = np.concatenate([self._climb(shape, view, candidates[keep]), candidates[keep]])
             score, scores = self.score(shape, view, candidates)
-            keep = self._distinct(shape, candidates, score)
+            keep = self._distinct(shape, candidates, score, twins)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe)
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
@@ -325,8 +333,20 @@ class Proposer:
         around = se3.retract(poses[:, None], noise)
         return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
 
-    def _distinct(self, shape: Shape, poses: Array, score: Array) -> list[int]:
-        return distinct(shape, poses, score, _ONE_POSE, self.settings.max_modes)
+    def _turned(self, shape: Shape, view: View, poses: Array, twins: Array) -> Array:
+        """The best of poses (n, 4, 4) turned by near-symmetries (t, 3, 3): (t, 4, 4)."""
+        best = self._best(shape, view.coarse(), poses, 1)
+        return np.asarray(best @ se3.make(twins, np.zeros((len(twins), 3))))
+
+    def _distinct(self, shape: Shape, poses: Array, score: Array, twins: Array) -> list[int]:
+        """Rows of the best few poses (n, 4, 4), and beside those of the best of each near-symmetry (t, 3, 3)."""
+        rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
+        kept = rows[: self.settings.max_modes]
+        for turned in poses[rows[0]] @ se3.make(twins, np.zeros((len(twins), 3))):
+            there = near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
+            if there.any() and rows[int(np.argmax(there))] not in kept:
+                kept.append(rows[int(np.argmax(there))])
+        return sorted(kept, key=lambda row: (-score[row], row))
 
     def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> Array:
         """Covariances (n, 6, 6): how far the score lets a pose go along the axes of its normal equations.

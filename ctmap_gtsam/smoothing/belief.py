@@ -28,6 +28,20 @@ _STAYED = 0.5
 
 
 @dataclass(frozen=True)
+class Held:
+    """A pose that stands for an object at a keyframe."""
+
+    view: int
+    """position of the view that it is taken from in `Thing.keyframes`"""
+    T_world_centre: Array
+    """(4, 4)"""
+    covariance: Array
+    """(6, 6)"""
+    smoothed: bool
+    """from the graph, with all that a camera gets wrong in the covariance; else a single view's"""
+
+
+@dataclass(frozen=True)
 class Thing:
     """One object: its detections, sightings, and the trellis of every class."""
 
@@ -113,20 +127,17 @@ class Thing:
         """(1, 4, 4) best guess of class c at a keyframe: smoothed, or the trellis's nearest mode."""
         if c == self.best_class and self.poses:
             return self.poses[_nearest(sorted(self.poses), keyframe)][0][None]
-        near = self._mode_near(c, keyframe)
-        return None if near is None else near[0][None]
+        i = self._measured_near(c, keyframe)
+        return None if i is None else self.stages[c][i].T_world_centre[self.posteriors[c].path[i]][None]
 
-    def _mode_near(self, c: int, keyframe: int) -> tuple[Array, Array] | None:
-        """Pose (4, 4) and covariance (6, 6) of the mode of class c that the best path goes through nearest in time."""
+    def _measured_near(self, c: int, keyframe: int) -> int | None:
+        """The view nearest in time in which the best path of class c goes through a mode."""
         stages = self.stages.get(c)
         if stages is None:
             return None
         path = self.posteriors[c].path
         there = [i for i, s in enumerate(stages) if path[i] < len(s.log_evidence)]
-        if not there:
-            return None
-        i = min(there, key=lambda i: (abs(stages[i].keyframe - keyframe), i))
-        return stages[i].T_world_centre[path[i]], stages[i].covariance[path[i]]
+        return min(there, key=lambda i: (abs(stages[i].keyframe - keyframe), i)) if there else None
 
     def presence_at(self, keyframe: int) -> float:
         """P(present | it exists) at any keyframe: that of the last one in view, or of the first before that."""
@@ -167,27 +178,34 @@ class Thing:
             stayed = True
         return out
 
-    def held(self, keyframe: int) -> tuple[Array, Array] | None:
-        """Pose and covariance in the reported class at a keyframe; None where it has none.
+    def held(self, keyframe: int) -> Held | None:
+        """What is believed of the reported class at a keyframe; None where it has no pose.
 
         Smoothed at the nearest measured keyframe, the past first; what more likely doesn't exist isn't smoothed.
         """
-        if self.reported_class != self.best_class or not self.poses:
-            return self._mode_near(self.reported_class, keyframe)
-        keyframes = sorted(self.poses)
-        before = [k for k in keyframes if k <= keyframe]
-        return self.poses[before[-1] if before else keyframes[0]]
+        c = self.reported_class
+        if c != self.best_class or not self.poses:
+            i = self._measured_near(c, keyframe)
+            if i is None:
+                return None
+            stage, state = self.stages[c][i], self.posteriors[c].path[i]
+            return Held(i, stage.T_world_centre[state], stage.covariance[state], smoothed=False)
+        measured = sorted(self.poses)
+        before = [k for k in measured if k <= keyframe]
+        nearest = before[-1] if before else measured[0]
+        return Held(self.keyframes.index(nearest), *self.poses[nearest], smoothed=True)
 
-    def chosen_log_weight(self, keyframe: int) -> float:
-        """log share of the chosen mode among those of its class at a keyframe; 0 where nothing else is in question."""
-        if keyframe not in self.sightings:
-            return 0.0
-        i = self.keyframes.index(keyframe)
-        posterior = self.posteriors[self.reported_class]
-        marginal, state = posterior.modes[i], posterior.path[i]
-        if state >= len(marginal) - 2:
-            return 0.0
-        return float(np.log(max(marginal[state] / max(1.0 - marginal[-1], 1e-300), 1e-300)))
+    def shares(self, c: int, i: int) -> Array:
+        """(n,) of the modes of class c at its i-th view, given that it is there: their sum is 1.
+
+        What is unmeasured is where it was, and that is where the best path goes through.
+        """
+        marginal, state = self.posteriors[c].modes[i], self.posteriors[c].path[i]
+        shares = marginal[:-2].copy()
+        if state < len(shares):
+            shares[state] += marginal[-2]
+        total = shares.sum()
+        return shares / total if total > 0.0 else shares
 
     def with_poses(self, poses: Mapping[int, tuple[Array, Array]]) -> Thing:
         """The same with smoothed poses."""

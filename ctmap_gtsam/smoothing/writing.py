@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.place import describe
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.belief import Thing
+from ctmap_gtsam.smoothing.discrete import Stage
 from ctmap_gtsam.smoothing.graph import Smoothed
 from ctmap_gtsam.smoothing.modes import Recording
+from factors.symmetry import residual
 
 Array = NDArray[np.float64]
 
 _REPORTED = 1e-3  # modes and classes less probable than this are left out
+_LEAST = 1e-12  # weight of the reported pose, whatever rounding takes
+_SAME = 0.99  # of the scatter of one pose's views: a mode within it is no other pose
 
 
 def write(
@@ -72,44 +78,78 @@ def _write_pose(
     held = thing.held(k)
     if held is None:
         return
-    T, covariance = held
-    shape = model.shapes[thing.reported_class]
+    c, T = thing.reported_class, held.T_world_centre
+    shape = model.shapes[c]
+    tables.in_view[row, k] = _share_in_view(shape, T, T_world_camera, recording, k) > 0.0
+    covariance = held.covariance
+    if not held.smoothed:
+        covariance = covariance + _shared(thing.stages[c][held.view], T, recording, model)
+    # the heaviest mode is the pose: what a single view takes for another one, within its own scatter, is none
+    weight = 1.0
+    for share, other, spread in _alternatives(thing, c, held.view, recording, model):
+        if _within(T, covariance, other, spread, shape):
+            continue
+        weight -= share
+        if share >= _REPORTED:
+            _write_mode(tables, row, k, shape, share, other, spread)
+    _write_mode(tables, row, k, shape, max(weight, _LEAST), T, covariance)
+    for other_class in thing.posteriors:
+        if other_class != c and thing.class_probability[other_class] >= _REPORTED and k in thing.sightings:
+            _write_class(tables, row, k, thing, other_class, recording, model)
+
+
+def _share_in_view(shape: Shape, T: Array, T_world_camera: Array, recording: Recording, k: int) -> float:
     camera = recording.run.frames[int(recording.keyframes[k])].camera
-    tables.in_view[row, k] = outlook(shape, np.linalg.inv(T_world_camera) @ T, camera).share > 0.0
+    return outlook(shape, np.linalg.inv(T_world_camera) @ T, camera).share
+
+
+def _write_class(tables: Tables, row: int, k: int, thing: Thing, c: int, recording: Recording, model: Model) -> None:
+    """The modes of a class that is still possible, as its own trellis weighs them."""
+    i = thing.keyframes.index(k)
+    shares = thing.shares(c, i)
+    for state in np.flatnonzero(shares >= _REPORTED).tolist():
+        T = thing.stages[c][i].T_world_centre[state]
+        spread = thing.stages[c][i].covariance[state] + _shared(thing.stages[c][i], T, recording, model)
+        _write_mode(tables, row, k, model.shapes[c], shares[state], T, spread)
+
+
+def _alternatives(
+    thing: Thing, c: int, i: int, recording: Recording, model: Model
+) -> Iterator[tuple[float, Array, Array]]:
+    """Share, pose (4, 4) and covariance (6, 6) of the modes of a view that the best path doesn't go through."""
+    stage, shares = thing.stages[c][i], thing.shares(c, i)
+    for state in range(len(shares)):
+        if state != thing.posteriors[c].path[i]:
+            T = stage.T_world_centre[state]
+            yield float(shares[state]), T, stage.covariance[state] + _shared(stage, T, recording, model)
+
+
+def _shared(stage: Stage, T_world_centre: Array, recording: Recording, model: Model) -> Array:
+    """(6, 6) what a single view doesn't say of its own error: localisation's, and the depth's bias."""
+    away = float(np.linalg.norm(recording.T_world_camera(stage.keyframe)[:3, 3] - T_world_centre[:3, 3]))
+    return np.diag(model.shared_variance(recording.run.localisation, away))
+
+
+def _within(T: Array, covariance: Array, other: Array, spread: Array, shape: Shape) -> bool:
+    """Whether a view's mode says nothing else than the reported pose: it lies where that one's views scatter anyhow."""
+    S = shape.symmetry
+    r = S.projection @ residual(T, other, S)
+    d = float(r @ np.linalg.solve(S.reduced_covariance(covariance + spread), r))
+    return d <= float(chi2.ppf(_SAME, len(r)))
+
+
+def _write_mode(
+    tables: Tables, row: int, k: int, shape: Shape, share: float, T_world_centre: Array, covariance: Array
+) -> None:
     tables.mode(
         row,
         k,
         shape.source.obj_id,
-        thing.chosen_log_weight(k),
-        shape.to_object(T),
+        float(np.log(share)),
+        shape.to_object(T_world_centre),
         shape.covariance_to_object(covariance),
         shape.free_axes_to_object(shape.symmetry.free_axes),
     )
-    _write_alternatives(tables, row, k, thing, model)
-
-
-def _write_alternatives(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
-    """Other modes of the reported class, and of other classes that are still possible, as the trellis weighs them."""
-    for c, posterior in thing.posteriors.items():
-        if thing.class_probability[c] < _REPORTED or k not in thing.sightings:
-            continue
-        i = thing.keyframes.index(k)
-        stage, marginal = thing.stages[c][i], posterior.modes[i]
-        present = max(1.0 - marginal[-1], 1e-300)
-        shape = model.shapes[c]
-        for state in range(len(stage.log_evidence)):
-            share = marginal[state] / present
-            if share < _REPORTED or (c == thing.reported_class and state == posterior.path[i]):
-                continue
-            tables.mode(
-                row,
-                k,
-                shape.source.obj_id,
-                float(np.log(share)),
-                shape.to_object(stage.T_world_centre[state]),
-                shape.covariance_to_object(stage.covariance[state]),
-                shape.free_axes_to_object(shape.symmetry.free_axes),
-            )
 
 
 def _write_ledger(tables: Tables, row: int, k: int, thing: Thing) -> None:

@@ -111,6 +111,38 @@ def test_modes_are_apart_best_first_and_no_more_than_asked_for():
     assert len(proposer.modes(shape, view, np.zeros((0, 4, 4)))) == 0
 
 
+@pytest.mark.parametrize("name", ["banana", "mug", "cereal_box", "soup_can", "hammer"])
+def test_near_symmetries_are_turns_after_which_a_thing_looks_nearly_but_not_just_as_before(name):
+    shape = shape_named(MODEL, name)
+    twins = se3.make(shape.twins, np.zeros((len(shape.twins), 3)))
+    for T in twins:
+        assert errors(np.eye(4), T, shape)[0] > 0.1
+        off = np.abs(shape.distance.at(se3.transform(T, shape.mesh.vertices)))
+        assert off.mean() < 0.2 * shape.radius_m
+    for a in range(len(twins)):
+        assert (errors(twins[a], np.delete(twins, a, axis=0), shape)[0] > 0.1).all()
+
+
+def test_a_banana_has_one_near_symmetry_and_a_can_has_none():
+    assert len(shape_named(MODEL, "soup_can").twins) == 0
+    (turn,) = shape_named(MODEL, "banana").twins
+    assert np.linalg.norm(se3.so3_log(turn)) == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whichever_way_round_it_is_tried_both_ways_are_modes(seed):
+    """Started as it would look nearly the same, what lies there is found, beside what was started from."""
+    proposer, shape, view, _, T = scene("banana", seed)
+    turned = T @ se3.make(shape.twins, np.zeros((1, 3)))
+    for start in (T[None], turned):
+        modes = proposer.modes(shape, view, start, near_symmetries=True)
+        turn, shift = errors(T, modes.T_camera_centre[0], shape)
+        assert turn < 0.05
+        assert shift < 0.003
+        assert (errors(turned[0], modes.T_camera_centre, shape)[0] < 0.4).any()
+        assert (np.diff(modes.log_likelihood) <= 0).all()
+
+
 def test_no_mode_scores_less_than_its_start():
     proposer, shape, view, _, T = scene("mug")
     starts = se3.retract(T, np.random.default_rng(3).normal(size=(10, 6)) * np.repeat([0.3, 0.02], 3))

@@ -75,7 +75,10 @@ def test_mixtures_are_normalised_and_covariances_proper(estimate):
         for k in range(len(estimate.keyframe_frame)):
             for c in np.unique(m.class_id):
                 own = (m.object == row) & (m.keyframe == k) & (m.class_id == c)
-                assert np.exp(m.log_weight[own]).sum() <= 1.0 + 1e-6
+                weight = np.exp(m.log_weight[own]).sum()
+                assert weight <= 1.0 + 1e-6
+                if own.any() and c == estimate.best_class[row, k]:
+                    assert weight > 0.98  # but for modes that are too unlikely to be written
 
 
 def test_what_was_taken_away_was_there_before_and_not_after():
