@@ -21,7 +21,7 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
 from ctmap_gtsam.filtering.diagnostics import Scored, diagnostics
 from ctmap_gtsam.filtering.history import one_past
-from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
+from ctmap_gtsam.filtering.identity import WAS_THERE, as_moved, at_place, moved_to, twin
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
@@ -85,8 +85,8 @@ class Forward:
         self.beliefs: dict[int, Belief] = {}
         self.owner: dict[int, int] = {}
         """track -> object"""
-        self.surest: dict[int, float] = {}
-        """object -> the largest existence it ever had"""
+        self.known: dict[int, Array] = {}
+        """object -> class probabilities (C,) when it last surely was there"""
         self.reports: list[dict[int, Reported]] = []
         self.found_moved: list[tuple[int, tuple[int, int], float]] = []
         """object, times of its last detection at the old place and its first at the new one, P(it is the same)"""
@@ -117,8 +117,7 @@ class Forward:
                 reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
         new = [t for t in tracks if t.track_id not in self.owner]
         reported = self._start(new, observation, reported, before, stage)
-        for i, r in reported.items():
-            self.surest[i] = max(self.surest.get(i, 0.0), r.existence)
+        self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
         self.reports.append(self._find_moved(self._merge(reported)))
 
     @contextmanager
@@ -203,11 +202,11 @@ class Forward:
 
     def _find_moved(self, reported: dict[int, Reported]) -> dict[int, Reported]:
         """Objects whose place was found empty and that are met elsewhere go on there."""
-        moved = moved_to(self.beliefs, reported, self.surest, self.model)
+        moved = moved_to(self.beliefs, reported, self.known, self.model)
         for i, (found, same) in moved.items():
             between = self.beliefs[i].present_ns, self.beliefs[found].first_ns
             self.found_moved.append((i, between, same))
-            self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.model)
+            self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.known[i])
             self.owner |= {track: i for track, owner in self.owner.items() if owner == found}
             reported[i] = reported.pop(found)
         return reported

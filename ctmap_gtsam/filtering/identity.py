@@ -17,11 +17,13 @@ from scipy.optimize import linear_sum_assignment
 from ctmap_gtsam.filtering.belief import Belief, Reported
 from ctmap_gtsam.filtering.history import moved_past
 from ctmap_gtsam.model import Model
-from factors import mixture
+from ctmap_gtsam.shapes import one_place_m
 
-_ONE_PLACE = 0.5  # of the smaller thing's radius: solid things can't have centres so near
+Array = NDArray[np.float64]
+
 _SAME_CLASS = 0.5  # least P(both are of one class) for a join
-_WAS_THERE = 0.8  # an object that never existed with this probability can't have moved
+WAS_THERE = 0.8
+"""an object that never existed with this probability can't have moved"""
 _MISTAKEN = 0.1  # of the objects that seem to be found again, so many are others of like class
 
 
@@ -34,9 +36,9 @@ def at_place(track_report: Reported, objects: Mapping[int, Reported], model: Mod
     for i, other in sorted(objects.items()):
         if other.best_pose is None:
             continue
-        radius = min(model.shapes[r.best_class].radius_m for r in (track_report, other))
         apart = float(np.linalg.norm(T[:3, 3] - other.best_pose[:3, 3]))
-        if apart < min(_ONE_PLACE * radius, closest):
+        own, its = (model.shapes[r.best_class] for r in (track_report, other))
+        if apart < min(one_place_m(own, its), closest):
             nearest, closest = i, apart
     return nearest
 
@@ -48,50 +50,46 @@ def twin(report: Reported, objects: Mapping[int, Reported], model: Model) -> int
 
 
 def moved_to(
-    beliefs: Mapping[int, Belief], reports: Mapping[int, Reported], surest: Mapping[int, float], model: Model
+    beliefs: Mapping[int, Belief], reports: Mapping[int, Reported], known: Mapping[int, Array], model: Model
 ) -> dict[int, tuple[int, float]]:
     """Which objects were found again as others, by a global assignment.
 
     Args:
         beliefs: of every object.
         reports: of this keyframe.
-        surest: the largest existence that each object ever had.
+        known: what each object that ever surely was there was when it last was, class probabilities (C,): what it would
+            be if it were there now is no class that it had.
         model: tells what can be moved.
 
     Returns:
         Object -> the object that it is now, and P(both are of one class).
     """
-    gone = [i for i in sorted(reports) if reports[i].existence < 0.5 and surest[i] > _WAS_THERE]
-    there = [i for i in sorted(reports) if reports[i].existence > _WAS_THERE]
+    gone = [i for i in sorted(reports) if reports[i].existence < 0.5 and i in known]
+    there = [i for i in sorted(reports) if reports[i].existence > WAS_THERE]
     if not gone or not there:
         return {}
     movable = np.array([shape.source.movable for shape in model.shapes])
-    same = np.array(
-        [[_one_class(beliefs[a], reports[a], beliefs[b], reports[b], movable) for b in there] for a in gone]
-    )
+    same = np.array([[_one_class(beliefs[a], beliefs[b], known[a], reports[b], movable) for b in there] for a in gone])
     rows, columns = linear_sum_assignment(-same)
     return {
         gone[r]: (there[c], float(same[r, c])) for r, c in zip(rows, columns, strict=True) if same[r, c] >= _SAME_CLASS
     }
 
 
-def _one_class(
-    gone: Belief, gone_report: Reported, found: Belief, found_report: Reported, movable: NDArray[np.bool_]
-) -> float:
+def _one_class(gone: Belief, found: Belief, known: Array, found_report: Reported, movable: NDArray[np.bool_]) -> float:
     """P(one class that can be moved) where the second began after the first was last seen at its place, else 0."""
     if found.first_ns <= gone.present_ns:
         return 0.0
-    return float((gone_report.class_probability * found_report.class_probability)[movable].sum())
+    return float((known * found_report.class_probability)[movable].sum())
 
 
-def as_moved(old: Belief, found: Belief, model: Model) -> Belief:
-    """The belief of an object at its new place: what was known of its class is still known."""
-    known = mixture.normalised(old.class_log_evidence(model)) + np.log(len(old.classes))
-    known = np.logaddexp(np.log1p(-_MISTAKEN) + known, np.log(_MISTAKEN))
+def as_moved(old: Belief, found: Belief, known: Array) -> Belief:
+    """The belief of an object at its new place: what was known of its class (C,) is still known."""
+    evidence = np.log((1.0 - _MISTAKEN) * len(known) * known + _MISTAKEN)
     return replace(
         found,
         object_id=old.object_id,
-        score_evidence=found.score_evidence + known,
+        score_evidence=found.score_evidence + evidence,
         first_ns=old.first_ns,
         past=moved_past(found.past, old.past),
     )

@@ -241,7 +241,9 @@ def judge(
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
     best = int(np.argmax(log_evidence))
     witness = _witness(stages[best], posteriors[best], sightings, best) if best in stages else 0.0
-    posterior = model.existence(log_evidence, posed, clutter, witness, 0.0)
+    solid, probability = model.existence(log_evidence, posed, clutter, witness, 0.0)
+    # objects are what was detected: what has no box of its own left is what others are
+    posterior = (solid if boxes else 0.0, probability)
     return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior)
 
 
