@@ -164,6 +164,13 @@ def test_hypotheses_of_the_forward_pass_go_in_and_nothing_else(scene, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
+def test_what_nothing_detects_is_no_object_however_well_a_mesh_explains_the_depth(scene):
+    run, _ = scene
+    visits = tuple(replace(v, frames=tuple(replace(f, detections=()) for f in v.frames)) for v in run.visits)
+    estimate = smooth_run(replace(run, visits=visits), filter_run(run, CONFIG), CONFIG)
+    assert (estimate.existence == 0.0).all()
+
+
 def test_a_forward_pass_of_another_run_is_refused(scene):
     other = replace(scene[0], fingerprint="of other images")
     with pytest.raises(ValueError, match="another run"):
