@@ -114,7 +114,7 @@ class Shape:
         return distance_field(self.mesh)
 
     @cached_property
-    def twins(self) -> Array:
+    def near_symmetries(self) -> Array:
         """(n, 3, 3) near-symmetries: turns about the centre after which the mesh looks nearly, but not just, as before.
 
         Of the 24 turns that carry the frame's axes into each other, those after which the surface's mean distance from

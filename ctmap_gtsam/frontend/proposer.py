@@ -35,6 +35,13 @@ ENOUGH_SAMPLES = 40
 _HALF_TURNS = np.stack([np.diag(d).astype(np.float64) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
 _LADDER_M = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.04])
 """steps at which the score's shape is probed, metres at the object's radius"""
+
+PROBED_M = float(_LADDER_M[-1])
+"""how far the score's shape is probed: the standard deviation of a mode along an axis that shows nothing"""
+
+FLAT_M = 0.5 * PROBED_M
+"""standard deviation from which on an axis is free: a score that is even as far as it is probed has a little more"""
+
 _CLIMBS, _CLIMB_NATS = 6, 0.05  # at most so many moves on the score, each gaining at least this much
 _SMALL_REACH_M = 0.3  # of things that are refined with the configured widths
 _LARGE_SAMPLES = 0.25  # of the configured samples, as many as tell where furniture is as well as all of them
@@ -208,7 +215,7 @@ class Proposer:
         """
         if len(starts) == 0:
             return _no_modes()
-        twins = shape.twins if near_symmetries else np.zeros((0, 3, 3))
+        twins = shape.near_symmetries if near_symmetries else np.zeros((0, 3, 3))
         if len(twins):
             starts = np.concatenate([starts, self._turned(shape, view, starts, twins)])
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])

@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.batched import Batch, Problem
@@ -33,6 +34,7 @@ Array = NDArray[np.float64]
 _EXACT = np.repeat([1e-5, 1e-5], 3)
 """rad, metres: how well a camera pose is known that is recorded without error"""
 _STRIDE = 1_000_000
+_FURTHEST = 1e8  # ratio of variances of an object-visit's shared error
 
 
 @dataclass(frozen=True)
@@ -364,7 +366,7 @@ def _add_object(
     T = _one_image(T, S)
     if len(measured) > old:
         new = slice(old, None)
-        _add_measurements(built, model, row, S, measured[new], recorded[new], T[new], keys[new], names[new])
+        _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new], names[new])
     _add_predictions(built, model, S, measured, keys, names)
 
 
@@ -372,7 +374,7 @@ def _add_measurements(
     built: SmootherGraph,
     model: Model,
     row: int,
-    S: symmetry.Symmetry,
+    shape: Shape,
     measured: Sequence[Measured],
     recorded: Array,
     T: Array,
@@ -381,8 +383,10 @@ def _add_measurements(
 ) -> None:
     for key, pose in zip(keys.tolist(), T, strict=True):
         built.initial.insert(key, gtsam.Pose3(pose))
+    S, radius_m = shape.symmetry, shape.radius_m
     for visit in dict.fromkeys(m.visit for m in measured):
-        _add_bias(built, model, row, visit)
+        views = np.stack([m.covariance for m in measured if m.visit == visit])
+        _add_bias(built, model, row, visit, shared_flatness(views, radius_m))
     seen_by = [(camera_key(m.keyframe), key, bias_key(row, m.visit)) for m, key in zip(measured, keys, strict=True)]
     information = np.linalg.inv(np.stack([m.covariance for m in measured]))
     modes = Modes(se3.inverse(recorded) @ T, information, S)
@@ -422,14 +426,38 @@ def _add_predictions(
         built.add("prediction", names[i], stay_factor(int(keys[i - 1]), int(keys[i]), covariance))
 
 
-def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int) -> None:
+def shared_flatness(covariances: Array, radius_m: float) -> Array:
+    """What no view of an object-visit shows, they all leave open alike: the variance (6, 6) of it that they share.
+
+    A view's score is probed over a few centimetres of the surface. A covariance as wide as that is where the probe
+    ended, and says nothing; a hundred such views say nothing, too.
+
+    Args:
+        covariances: (n, 6, 6) of the views, of the right tangent.
+        radius_m: turns rad into metres of the surface.
+    """
+    unit = np.repeat([1.0 / radius_m, 1.0], 3)
+    information, axes = np.linalg.eigh(np.linalg.inv(covariances / unit[:, None] / unit))
+    told = np.einsum("nik,nk,njk->ij", axes, np.maximum(information - FLAT_M**-2.0, 0.0), axes)
+    information, axes = np.linalg.eigh(told)
+    flat = unit[:, None] * axes[:, information < PROBED_M**-2.0] * PROBED_M
+    return np.asarray(flat @ flat.T)
+
+
+def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int, flatness: Array) -> None:
+    """The error that the measurements of an object-visit share: the depth's, and what none of them shows."""
     key = bias_key(row, visit)
     if built.initial.exists(key):
         return
     settings = model.config.sensor
     sigmas = np.repeat([settings.bias_rotation_rad, settings.bias_translation_m], 3)
     built.initial.insert(key, np.zeros(6))
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    if flatness.any():
+        # the root of diag(sigmas^2) + flatness, in units of the sigmas; not so far apart that elimination fails
+        times, axes = np.linalg.eigh(np.eye(6) + flatness / sigmas[:, None] / sigmas)
+        times = np.minimum(times, _FURTHEST)
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation((axes / np.sqrt(times)) @ axes.T / sigmas)
     built.add("bias", f"object {row} visit {visit}", gtsam.PriorFactorVector(key, np.zeros(6), noise))
 
 

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.place import describe
+from ctmap_gtsam.frontend.proposer import FLAT_M
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -23,6 +24,7 @@ from factors.symmetry import residual
 Array = NDArray[np.float64]
 
 _REPORTED = 1e-3  # modes and classes less probable than this are left out
+_MOST_FREE = 3  # columns that an Estimate has for free axes
 _LEAST = 1e-12  # weight of the reported pose, whatever rounding takes
 _SAME = 0.99  # of the scatter of one pose's views: a mode within it is no other pose
 
@@ -148,8 +150,26 @@ def _write_mode(
         float(np.log(share)),
         shape.to_object(T_world_centre),
         shape.covariance_to_object(covariance),
-        shape.free_axes_to_object(shape.symmetry.free_axes),
+        shape.free_axes_to_object(free_axes(shape, covariance)),
     )
+
+
+def free_axes(shape: Shape, covariance: Array) -> Array:
+    """Orthonormal columns (6, f <= 3) of the motions that a pose leaves free: its symmetry's, and those left so wide.
+
+    Wide is what a view's score is as far as it is probed where it shows nothing.
+
+    Args:
+        shape: the class.
+        covariance: (6, 6) of the right tangent in the centre frame.
+    """
+    unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
+    own = shape.symmetry.free_axes
+    # in the unit in which a turn moves the surface by as much as a shift
+    rest = np.linalg.svd(own / unit[:, None])[0][:, own.shape[1] :]
+    variance, axes = np.linalg.eigh(rest.T @ (covariance / unit[:, None] / unit) @ rest)
+    wide = (rest @ axes[:, variance >= FLAT_M**2])[:, ::-1] * unit[:, None]
+    return np.asarray(np.linalg.qr(np.concatenate([own, wide[:, : _MOST_FREE - own.shape[1]]], axis=1))[0])
 
 
 def _write_ledger(tables: Tables, row: int, k: int, thing: Thing) -> None:

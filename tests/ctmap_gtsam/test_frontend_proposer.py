@@ -114,7 +114,7 @@ def test_modes_are_apart_best_first_and_no_more_than_asked_for():
 @pytest.mark.parametrize("name", ["banana", "mug", "cereal_box", "soup_can", "hammer"])
 def test_near_symmetries_are_turns_after_which_a_thing_looks_nearly_but_not_just_as_before(name):
     shape = shape_named(MODEL, name)
-    twins = se3.make(shape.twins, np.zeros((len(shape.twins), 3)))
+    twins = se3.make(shape.near_symmetries, np.zeros((len(shape.near_symmetries), 3)))
     for T in twins:
         assert errors(np.eye(4), T, shape)[0] > 0.1
         off = np.abs(shape.distance.at(se3.transform(T, shape.mesh.vertices)))
@@ -124,8 +124,8 @@ def test_near_symmetries_are_turns_after_which_a_thing_looks_nearly_but_not_just
 
 
 def test_a_banana_has_one_near_symmetry_and_a_can_has_none():
-    assert len(shape_named(MODEL, "soup_can").twins) == 0
-    (turn,) = shape_named(MODEL, "banana").twins
+    assert len(shape_named(MODEL, "soup_can").near_symmetries) == 0
+    (turn,) = shape_named(MODEL, "banana").near_symmetries
     assert np.linalg.norm(se3.so3_log(turn)) == pytest.approx(np.pi)
 
 
@@ -133,7 +133,7 @@ def test_a_banana_has_one_near_symmetry_and_a_can_has_none():
 def test_whichever_way_round_it_is_tried_both_ways_are_modes(seed):
     """Started as it would look nearly the same, what lies there is found, beside what was started from."""
     proposer, shape, view, _, T = scene("banana", seed)
-    turned = T @ se3.make(shape.twins, np.zeros((1, 3)))
+    turned = T @ se3.make(shape.near_symmetries, np.zeros((1, 3)))
     for start in (T[None], turned):
         modes = proposer.modes(shape, view, start, near_symmetries=True)
         turn, shift = errors(T, modes.T_camera_centre[0], shape)

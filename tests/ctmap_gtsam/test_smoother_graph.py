@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.smoothing.graph import Camera, Measured, bias_key, build, smooth
+from ctmap_gtsam.smoothing.graph import Camera, Measured, bias_key, build, shared_flatness, smooth
+from ctmap_gtsam.smoothing.writing import free_axes
 from factors import mixture
 from factors.custom import FactorValueError
 from factors.symmetry import residual
@@ -154,6 +156,42 @@ def test_a_thousand_views_of_one_visit_leave_the_bias():
     bias = CONFIG.sensor.bias_translation_m
     assert sigma(300, 1) == pytest.approx(bias, rel=0.02)
     assert sigma(300, 2) == pytest.approx(bias / np.sqrt(2), rel=0.02)
+
+
+def views_with(spread, n):
+    """n views of a still thing, a keyframe each, all of covariance `spread` (6, 6)."""
+    cameras = [Camera(np.eye(4), 0.5 * k, 0) for k in range(n)]
+    return cameras, [Measured(k, 0.5 * k, 0, np.eye(4), spread, stays=k > 0) for k in range(n)]
+
+
+@pytest.mark.parametrize("n", [1, 4, 60])
+def test_a_turn_that_no_view_shows_stays_open_however_many_there_are(n):
+    model = Model(
+        classes("mug"), config_of("prediction.rotation_rate=1e-6", "sensor.bias_rotation_rad=1e-3"), context=False
+    )
+    open_rad = PROBED_M / MUG.radius_m
+    turn = se3.so3_exp(np.array([0.3, -0.5, 0.2]))[:, 2]
+    spread = np.diag(np.repeat([0.02, 0.002], 3) ** 2)
+    spread[:3, :3] += open_rad**2 * np.outer(turn, turn)
+    cameras, measured = views_with(spread, n)
+    objects = {0: (MUG, measured)}
+    found = smooth(build(model, cameras, LocalisationNoise(0.0, 0.0, 1.0), objects), model, objects, n)
+    covariance = found.objects[0][0][1][:3, :3]
+    assert np.sqrt(turn @ covariance @ turn) > 0.95 * open_rad
+    across = np.cross(turn, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    assert np.sqrt(across @ covariance @ across) == pytest.approx(np.hypot(0.02 / np.sqrt(n), 1e-3), rel=0.02)
+
+
+def test_views_that_show_all_share_no_flatness_and_one_that_shows_an_axis_closes_it():
+    radius = MUG.radius_m
+    precise, wide = np.repeat([0.02, 0.002], 3) ** 2, np.repeat([0.02, 0.002], 3) ** 2
+    wide[2] = (PROBED_M / radius) ** 2
+    assert not shared_flatness(np.stack([np.diag(precise)] * 5), radius).any()
+    assert not shared_flatness(np.stack([np.diag(wide)] * 5 + [np.diag(precise)]), radius).any()
+    alone = np.zeros(6)
+    alone[2] = wide[2]
+    np.testing.assert_allclose(shared_flatness(np.stack([np.diag(wide)] * 5), radius), np.diag(alone), atol=1e-12)
 
 
 def test_a_move_cuts_the_track_and_what_is_left_shares_only_the_bias():
@@ -349,3 +387,21 @@ def test_how_wide_the_gauge_is_says_nothing_of_what_isnt_free(name):
         np.testing.assert_allclose(P @ residual(T, other, symmetry), 0.0, atol=1e-6)
         expected = symmetry.reduced_covariance(covariance)
         np.testing.assert_allclose(symmetry.reduced_covariance(narrow), expected, atol=1e-3 * np.diag(expected).max())
+
+
+@pytest.mark.parametrize("name", ["mug", "bowl"])
+def test_free_axes_are_the_symmetrys_and_those_left_as_wide_as_a_score_that_shows_nothing(name):
+    shape = Model(classes(name), CONFIG).shapes[0]
+    unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
+    close = np.diag((0.1 * FLAT_M * unit) ** 2)
+    own = shape.symmetry.free_axes
+    assert free_axes(shape, close).shape == own.shape
+    lift = np.linalg.qr(np.concatenate([own, np.eye(6)], axis=1))[0][:, own.shape[1] :]
+    open_to = unit * lift[:, 1] / np.linalg.norm(unit * lift[:, 1])
+    left = close + (2.0 * FLAT_M) ** 2 * np.outer(unit * lift[:, 1], unit * lift[:, 1])
+    found = free_axes(shape, left)
+    assert found.shape == (6, own.shape[1] + 1)
+    np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-9)
+    for column in (*own.T, open_to):
+        np.testing.assert_allclose(found @ (found.T @ column), column, atol=1e-6)
+    assert free_axes(shape, np.diag((3.0 * FLAT_M * unit) ** 2)).shape == (6, 3)
