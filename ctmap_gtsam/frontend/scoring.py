@@ -127,7 +127,8 @@ def _extent(projected, height, width):
 def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out):
     """Score one tile (h, w), rendered within `extent`, on measurements (h w,).
 
-    `out` is (7,): log ratio, covered, visible, box; `near_pixel` and `near_depth` are (h w + 1,) to work in.
+    `out` is (7,): log ratio, covered, visible, box in the tile.
+    `near_pixel` and `near_depth` are (h w + 1,) to work in.
     """
     height, width = inverse_depth.shape
     near, covered, visible = np.uintp(0), 0, 0
@@ -166,8 +167,9 @@ def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, ne
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _score(vertices, faces, solid, poses, camera, depth, without, past, parameters, margin, out):
+def _score(vertices, faces, solid, poses, camera, depth, without, past, parameters, margin, window, out):
     zs = depth.ravel()
+    x, y, step = window
     for part in numba.prange((len(poses) + PART - 1) // PART):
         projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape)
         chosen = np.empty((2, len(faces) + 1), np.int32)
@@ -178,6 +180,9 @@ def _score(vertices, faces, solid, poses, camera, depth, without, past, paramete
             inverse_depth[extent[0] : extent[1], extent[2] : extent[3]] = 0.0
             rasterise(projected, faces, solid, chosen, inverse_depth, None)
             _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
+            # samples stand for step x step pixels
+            for i, at, half in ((3, x, -step / 2.0), (4, y, -step / 2.0), (5, x, step / 2.0), (6, y, step / 2.0)):
+                out[k, i] = out[k, i] * step + at + half if out[k, 2] > 0.0 else np.nan
 
 
 def score_depth(
@@ -205,13 +210,10 @@ def score_depth(
         *tile.without_object(parameters),
         parameters,
         margin_m,
+        (tile.x, tile.y, tile.step),
         out,
     )
-    # samples stand for step x step pixels
-    half = tile.step / 2.0
-    box = out[:, 3:] * tile.step + np.array([tile.x, tile.y, tile.x, tile.y]) + np.array([-half, -half, half, half])
-    box[out[:, 2] == 0] = np.nan
-    return Scores(out[:, 0], out[:, 1], out[:, 2], box)
+    return Scores(out[:, 0], out[:, 1], out[:, 2], out[:, 3:])
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")

@@ -69,9 +69,7 @@ def measure(method: str, folder: Path, keyframes: int, config: Config, forward: 
         process.join()
 
 
-def _work(
-    connection: Connection, method: str, folder: Path, keyframes: int, config: Config, forward: Path
-) -> None:
+def _work(connection: Connection, method: str, folder: Path, keyframes: int, config: Config, forward: Path) -> None:
     round_, smooth = load_run(folder), method == "smooth"
     warm = filter_run(looped(round_, WARM), config)
     if smooth:
