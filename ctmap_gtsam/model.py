@@ -133,7 +133,7 @@ class Model:
         A mixture: some detected boxes have nothing to do with their objects.
         """
         d = self.config.detector
-        matched = box_log_ratio(detected, np.nan_to_num(rendered), d.box_sigma, image_size)
+        matched = box_log_ratio(detected, rendered, d.box_sigma, image_size)
         return np.logaddexp(np.log1p(-d.box_outlier) + matched, np.log(d.box_outlier))
 
     def detection(self, visible: Array, box_log_ratios: Array | None) -> Array:

@@ -352,17 +352,32 @@ def box_log_ratio(
 
     Args:
         box_detected: (..., 4) COCO xywh, pixels.
-        box_rendered: (..., 4) box of the rendered pixels that are visible; one without area gives -inf.
+        box_rendered: (..., 4) box of the rendered pixels that are visible; NaN or one without area gives -inf.
         sigma_rel: of a detector's edges, relative to the box.
         image_size: width, height in pixels.
     """
     found, drawn = np.asarray(box_detected, dtype=np.float64), np.asarray(box_rendered, dtype=np.float64)
-    scale = np.maximum(sigma_rel * drawn[..., 2:], 1.0) / np.sqrt(2.0)
-    miss_low = np.abs(found[..., :2] - drawn[..., :2])
-    miss_high = np.abs(found[..., :2] + found[..., 2:] - drawn[..., :2] - drawn[..., 2:])
-    log_density = (-2.0 * np.log(2.0 * scale) - (miss_low + miss_high) / scale).sum(axis=-1)
-    log_clutter = np.log(4.0) - 2.0 * np.log(image_size[0] * image_size[1])
-    return np.where((drawn[..., 2:] > 0).all(axis=-1), log_density - log_clutter, -np.inf)
+    pairs = np.empty((2, *np.broadcast(found, drawn).shape))
+    pairs[0], pairs[1] = found, drawn
+    out = np.empty(pairs.shape[1:-1])
+    log_clutter = math.log(4.0) - 2.0 * math.log(image_size[0] * image_size[1])
+    _box_log_ratios(*pairs.reshape(2, -1, 4), float(sigma_rel), log_clutter, out.reshape(-1))
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _box_log_ratios(found, drawn, sigma_rel, log_clutter, out):
+    for n in range(len(out)):
+        if not (drawn[n, 2] > 0.0 and drawn[n, 3] > 0.0):
+            out[n] = -np.inf
+            continue
+        log_density = 0.0
+        for axis in range(2):
+            scale = max(sigma_rel * drawn[n, 2 + axis], 1.0) / math.sqrt(2.0)
+            low = abs(found[n, axis] - drawn[n, axis])
+            high = abs(found[n, axis] + found[n, 2 + axis] - drawn[n, axis] - drawn[n, 2 + axis])
+            log_density += -2.0 * math.log(2.0 * scale) - (low + high) / scale
+        out[n] = log_density - log_clutter
 
 
 def class_log_ratio(scores: ArrayLike, class_prior: ArrayLike | None = None, floor: float = 0.05) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,17 +101,36 @@ def find_planes(
 
 def plane_depth(planes: tuple[Plane, ...], camera: Camera) -> NDArray[np.float32]:
     """Depth (h, w) of the nearest plane along each pixel's ray, metres; 0 where none is hit within its outline."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    rays = camera.backproject(u, v, np.ones(u.shape))
-    nearest = np.full(u.shape, np.inf)
+    nearest = np.full((camera.height, camera.width), np.inf)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for plane in planes:
-        slope = rays @ plane.normal
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = plane.offset / slope
-        z = np.where(np.isfinite(z) & (z > 0), z, np.inf)
-        hit = np.where(np.isfinite(z), z, 0.0)[..., None] * rays
-        nearest = np.where(np.isfinite(z) & plane.contains(hit), np.minimum(nearest, z), nearest)
+        _draw_plane(intrinsics, plane.normal, plane.offset, se3.inverse(plane.T_frame_plane), plane.hull, nearest)
     return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw_plane(intrinsics, normal, offset, T_plane_frame, hull, nearest):
+    """Lower `nearest` (h, w), depths along z, to the plane's wherever a pixel's ray meets it within its hull."""
+    low_x, high_x, low_y, high_y = hull[:, 0].min(), hull[:, 0].max(), hull[:, 1].min(), hull[:, 1].max()
+    for v in range(nearest.shape[0]):
+        for u in range(nearest.shape[1]):
+            rx, ry = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1]
+            z = offset / (rx * normal[0] + ry * normal[1] + normal[2])
+            if not (0.0 < z < nearest[v, u]):
+                continue
+            x = z * rx * T_plane_frame[0, 0] + z * ry * T_plane_frame[0, 1] + z * T_plane_frame[0, 2]
+            y = z * rx * T_plane_frame[1, 0] + z * ry * T_plane_frame[1, 1] + z * T_plane_frame[1, 2]
+            x, y = x + T_plane_frame[0, 3], y + T_plane_frame[1, 3]
+            if not (low_x <= x <= high_x and low_y <= y <= high_y):
+                continue
+            left, right = True, True
+            for i in range(len(hull)):
+                j = i + 1 if i + 1 < len(hull) else 0
+                side = (hull[j, 0] - hull[i, 0]) * (y - hull[i, 1]) - (hull[j, 1] - hull[i, 1]) * (x - hull[i, 0])
+                left &= side >= 0.0
+                right &= side <= 0.0
+            if left or right:
+                nearest[v, u] = z
 
 
 def up_from_planes(planes: tuple[Plane, ...], up_guess: Array, max_angle_rad: float = 1.2) -> Array | None:

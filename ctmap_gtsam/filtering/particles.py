@@ -159,21 +159,25 @@ def _log_sums(a, b, log_weight, images, out):
 
     `b` is (K images, D), the images of a query next to each other; `out` is (K,).
     """
-    exponents = np.empty(images * len(a))
+    columns, exponents = np.ascontiguousarray(a.T), np.empty(images * len(a))
     for query in range(len(out)):
-        largest, n = -np.inf, 0
-        for image in range(query * images, (query + 1) * images):
+        for i in range(images):
+            # a feature at a time for all rows, which is vectorised
+            squared = exponents[i * len(a) : (i + 1) * len(a)]
+            squared[:] = 0.0
+            for d in range(len(columns)):
+                at, column = b[query * images + i, d], columns[d]
+                for k in range(len(a)):
+                    squared[k] += (at - column[k]) ** 2
             for k in range(len(a)):
-                squared = 0.0
-                for d in range(a.shape[1]):
-                    squared += (b[image, d] - a[k, d]) ** 2
-                exponents[n] = log_weight[k] - 0.5 * squared
-                largest = max(largest, exponents[n])
-                n += 1
-        total = 0.0
-        for i in range(n):
-            if exponents[i] > largest - _NOTHING:
-                total += math.exp(exponents[i] - largest)
+                squared[k] = log_weight[k] - 0.5 * squared[k]
+        largest = -np.inf
+        for exponent in exponents:
+            largest = max(largest, exponent)
+        total, least = 0.0, largest - _NOTHING
+        for exponent in exponents:
+            if exponent > least:
+                total += math.exp(exponent - largest)
         out[query] = largest + math.log(total) if total > 0.0 else -np.inf
 
 

@@ -7,7 +7,7 @@ object depends on how large it appears and not on the camera's resolution.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
@@ -41,6 +41,16 @@ class Tile:
     """top row of the window in the image"""
     step: int
     """pixels between samples"""
+    _shared: dict[tuple[float, ...], tuple[Array, Array]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    """parameters -> what all hypotheses of the tile share: worked out once, it is scored many times"""
+
+    def without_object(self, parameters: tuple[float, ...]) -> tuple[Array, Array]:
+        """What a sample says without the object (h w, 6), and the log ratio where it is seen past (h w,)."""
+        if parameters not in self._shared:
+            self._shared[parameters] = _without_object(self.depth.ravel(), self.background.ravel(), parameters)
+        return self._shared[parameters]
 
 
 def cut_tile(
@@ -98,9 +108,26 @@ def _without_object(z, background, parameters):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel, near_depth, out):
-    """Score one rendered tile (h, w) on measurements (h w,); `out` is (7,): log ratio, covered, visible, box.
+def _extent(projected, height, width):
+    """Rows and columns [v0, v1), [u0, u1) of an image that projected points (3, V) may reach, a pixel to spare.
 
+    What lies outside need not be cleared nor read: most of a tile, as its box has a margin and hypotheses lie anywhere.
+    """
+    us, vs = projected[0], projected[1]
+    left, right, top, bottom = us[0], us[0], vs[0], vs[0]
+    for i in range(1, us.size):
+        left, right = min(left, us[i]), max(right, us[i])
+        top, bottom = min(top, vs[i]), max(bottom, vs[i])
+    u0, u1 = np.int64(min(max(left - 1.0, 0.0), width)), np.int64(max(min(right + 2.0, width), 0.0))
+    v0, v1 = np.int64(min(max(top - 1.0, 0.0), height)), np.int64(max(min(bottom + 2.0, height), 0.0))
+    return v0, v1, u0, u1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out):
+    """Score one tile (h, w), rendered within `extent`, on measurements (h w,).
+
+    `out` is (7,): log ratio, covered, visible, box in the tile.
     `near_pixel` and `near_depth` are (h w + 1,) to work in.
     """
     height, width = inverse_depth.shape
@@ -108,9 +135,9 @@ def _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel
     total = 0.0
     u0, v0, u1, v1 = width, height, -1, -1
     # without branches that pixels would take at random; those near the surface are kept for a loop of their own
-    for v in range(height):
+    for v in range(extent[0], extent[1]):
         first, last = width, -1
-        for u in range(width):
+        for u in range(extent[2], extent[3]):
             w = inverse_depth[v, u]
             if w == 0.0:
                 continue
@@ -140,18 +167,22 @@ def _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _score(vertices, faces, solid, poses, camera, depth, background, parameters, margin, out):
+def _score(vertices, faces, solid, poses, camera, depth, without, past, parameters, margin, window, out):
     zs = depth.ravel()
-    without, past = _without_object(zs, background.ravel(), parameters)
+    x, y, step = window
     for part in numba.prange((len(poses) + PART - 1) // PART):
         projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape)
         chosen = np.empty((2, len(faces) + 1), np.int32)
         near_pixel, near_depth = np.empty(zs.size + 1, np.uint32), np.empty(zs.size + 1)
         for k in range(part * PART, min(part * PART + PART, len(poses))):
-            inverse_depth[:] = 0.0
             project(vertices, poses[k], camera, projected)
+            extent = _extent(projected, depth.shape[0], depth.shape[1])
+            inverse_depth[extent[0] : extent[1], extent[2] : extent[3]] = 0.0
             rasterise(projected, faces, solid, chosen, inverse_depth, None)
-            _score_tile(inverse_depth, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
+            _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
+            # samples stand for step x step pixels
+            for i, at, half in ((3, x, -step / 2.0), (4, y, -step / 2.0), (5, x, step / 2.0), (6, y, step / 2.0)):
+                out[k, i] = out[k, i] * step + at + half if out[k, 2] > 0.0 else np.nan
 
 
 def score_depth(
@@ -176,16 +207,13 @@ def score_depth(
         poses,
         camera,
         tile.depth,
-        tile.background,
+        *tile.without_object(parameters),
         parameters,
         margin_m,
+        (tile.x, tile.y, tile.step),
         out,
     )
-    # samples stand for step x step pixels
-    half = tile.step / 2.0
-    box = out[:, 3:] * tile.step + np.array([tile.x, tile.y, tile.x, tile.y]) + np.array([-half, -half, half, half])
-    box[out[:, 2] == 0] = np.nan
-    return Scores(out[:, 0], out[:, 1], out[:, 2], box)
+    return Scores(out[:, 0], out[:, 1], out[:, 2], out[:, 3:])
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -219,14 +247,15 @@ def squared_differences(mesh: Mesh, tile: Tile, T_camera_object: Array) -> Array
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(projected, faces, solid, chosen, normals, T, camera, depth, inverse_depth, ids, width_m, H, g):
     """Point-to-plane normal equations of one pose in its own right tangent; returns the sum of weights."""
-    inverse_depth[:] = 0.0
+    v0, v1, u0, u1 = _extent(projected, depth.shape[0], depth.shape[1])
+    inverse_depth[v0:v1, u0:u1] = 0.0
     rasterise(projected, faces, solid, chosen, inverse_depth, ids)
     H[:] = 0.0
     g[:] = 0.0
     total = 0.0
     J = np.empty(6)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
+    for v in range(v0, v1):
+        for u in range(u0, u1):
             w = inverse_depth[v, u]
             z = depth[v, u]
             if w == 0.0 or z == 0.0:

@@ -1,5 +1,7 @@
 """Laws of the fused kernel and of the registration on depth."""
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -56,6 +58,18 @@ def test_the_fused_score_is_the_potential_summed_over_a_rendering(name, known):
         rows, columns = np.flatnonzero(seen[k].any(1)), np.flatnonzero(seen[k].any(0))
         box = [columns[0] - 0.5, rows[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5]
         np.testing.assert_allclose(scores.box[k], box, atol=1.0)
+
+
+def test_a_tile_with_another_background_is_scored_anew():
+    shape, T, depth, _ = some_view("mug", 2)
+    first, table = whole_image(depth), depth_of([], looking()).astype(np.float32)
+
+    def ratio(tile):
+        return score_depth(shape.mesh, tile, T[None], DEPTH.parameters(), MARGIN).log_ratio[0]
+
+    before = ratio(first)
+    assert ratio(replace(first, background=table)) == ratio(whole_image(depth, table)) != before
+    assert ratio(first) == before
 
 
 @settings(max_examples=20)

@@ -22,6 +22,8 @@ from ctmap_gtsam.smoothing.smoother import smooth_run
 from sequences.bop import load_run
 
 METHODS: dict[str, Callable[..., Estimate]] = {"filter": filter_run, "smooth": smooth_run}
+"""the smoother takes the filter's estimate, too"""
+
 WARM = 4  # keyframes of a first run, which loads kernels and builds what is built once
 
 
@@ -39,7 +41,7 @@ class Measured:
     """in the estimate"""
 
 
-def measure(method: str, folder: Path, keyframes: int, config: Config) -> Measured:
+def measure(method: str, folder: Path, keyframes: int, config: Config, forward: Path) -> Measured:
     """Run an estimator on so many keyframes of a loop, in a fresh process.
 
     Args:
@@ -47,13 +49,14 @@ def measure(method: str, folder: Path, keyframes: int, config: Config) -> Measur
         folder: one round, by `loop.write_loop`.
         keyframes: of the run.
         config: settings.
+        forward: the file in which the filter leaves its estimate, and from which the smoother begins.
 
     Raises:
         RuntimeError: the process died.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(there, method, folder, keyframes, config))
+    process = context.Process(target=_work, args=(there, method, folder, keyframes, config, forward))
     process.start()
     there.close()
     try:
@@ -66,14 +69,21 @@ def measure(method: str, folder: Path, keyframes: int, config: Config) -> Measur
         process.join()
 
 
-def _work(connection: Connection, method: str, folder: Path, keyframes: int, config: Config) -> None:
-    run = load_run(folder)
-    METHODS[method](looped(run, WARM), config)
+def _work(connection: Connection, method: str, folder: Path, keyframes: int, config: Config, forward: Path) -> None:
+    round_, smooth = load_run(folder), method == "smooth"
+    warm = filter_run(looped(round_, WARM), config)
+    if smooth:
+        smooth_run(looped(round_, WARM), warm, config)
+    given = (Estimate.load(forward),) if smooth else ()
+    run, estimator = looped(round_, keyframes), METHODS[method]
     clock = _Clock()
-    estimate = METHODS[method](looped(run, keyframes), config, progress=clock)
+    estimate = estimator(run, *given, config, progress=clock)
     seconds = time.perf_counter() - clock.began
     each = tuple(float(s) for s in np.diff([clock.began, *clock.ticks]))
-    connection.send(Measured(seconds, each, peak_mb(), len(estimate.object_id)))
+    measured = Measured(seconds, each, peak_mb(), len(estimate.object_id))
+    if not smooth:
+        estimate.save(forward)
+    connection.send(measured)
 
 
 @dataclass

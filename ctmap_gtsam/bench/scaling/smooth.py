@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctmap_gtsam.bench.scaling.measuring import measure
-from ctmap_gtsam.bench.scaling.sizes import FULL, Sizes, by_length, loops
+from ctmap_gtsam.bench.scaling.sizes import FORWARD, FULL, Sizes, by_length, loops
 from ctmap_gtsam.config import Config
 from sequences.progress import SILENT, Progress
 
@@ -12,9 +12,9 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
     """Measure.
 
     Returns:
-        `smooth.seconds_per_keyframe_N_objects` and `smooth.over_filter_N_objects`, its seconds over the filter's on the
-        same run; `smooth.seconds_per_keyframe_L` and `smooth.peak_mb_L` of runs of two lengths, with their ratios
-        `smooth.seconds_long_over_short` and `smooth.memory_long_over_short`.
+        `smooth.seconds_per_keyframe_N_objects` and `smooth.over_filter_N_objects`, its seconds, the forward pass left
+        out, over the filter's on the same run; `smooth.seconds_per_keyframe_L` and `smooth.peak_mb_L` of runs of two
+        lengths, with their ratios `smooth.seconds_long_over_short` and `smooth.memory_long_over_short`.
     """
     figures: dict[str, float] = {}
     objects = (*sizes.objects, sizes.length_objects)
@@ -23,13 +23,15 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
         for n in sizes.objects:
             seconds = {}
             for method in ("filter", "smooth"):
-                seconds[method] = measure(method, paths[n], sizes.keyframes, config).seconds
+                seconds[method] = measure(method, paths[n], sizes.keyframes, config, paths[n] / FORWARD).seconds
                 stage.advance()
             figures[f"smooth.seconds_per_keyframe_{n}_objects"] = seconds["smooth"] / sizes.keyframes
             figures[f"smooth.over_filter_{n}_objects"] = seconds["smooth"] / seconds["filter"]
         costs = []
         for length in sizes.lengths:
-            seen = measure("smooth", paths[sizes.length_objects], length, config)
+            path = paths[sizes.length_objects]
+            measure("filter", path, length, config, path / FORWARD)
+            seen = measure("smooth", path, length, config, path / FORWARD)
             costs.append((seen.seconds / length, seen.peak_mb))
             stage.advance()
     short, long = costs
