@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from ctmap_gtsam.model import Model
@@ -17,31 +18,74 @@ from ctmap_gtsam.shapes import one_place_m
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.modes import Recording
 
+Array = NDArray[np.float64]
+
 _SAME_CLASS = 0.5  # least P(both are of one class) for a join
 
 
-def merge_duplicates(things: Mapping[int, Thing], model: Model) -> dict[int, Thing]:
-    """Of things of one class in one place, present at one time, the one with most evidence stays."""
+def duplicates(things: Mapping[int, Thing], model: Model) -> dict[int, int]:
+    """Of things of one class in one place, present at one time: object -> the one with most evidence there."""
     kept: list[Thing] = []
+    out = {}
     for thing in sorted(things.values(), key=lambda t: (-t.log_evidence, t.object_id)):
-        if not any(_same(other, thing, model) for other in kept):
+        twin = next((other for other in kept if _same(other, thing, model)), None)
+        if twin is None:
             kept.append(thing)
-    return {thing.object_id: thing for thing in sorted(kept, key=lambda t: t.object_id)}
+        else:
+            out[thing.object_id] = twin.object_id
+    return out
+
+
+def merge_duplicates(things: Mapping[int, Thing], recording: Recording, model: Model) -> dict[int, Thing]:
+    """Things without duplicates: one of two that are one, and it is the one with more evidence that stays.
+
+    But what either was before, elsewhere, is kept, and the other with it: it is for `join_moved` to say whose past that
+    is.
+    """
+    left = dict(sorted(things.items()))
+    for i, j in duplicates(things, model).items():
+        for own, twin in ((i, j), (j, i)):
+            part = _elsewhere_before(things[own], things[twin], recording, model)
+            if part is not None:
+                left[own] = part
+                break
+        else:
+            del left[i]
+    return left
+
+
+def _elsewhere_before(thing: Thing, twin: Thing, recording: Recording, model: Model) -> Thing | None:
+    """The life of a thing in another place, before it came to be where its twin is; None where it had none."""
+    met = min(_shared(thing, twin))
+    boxes = {k: d for k, d in thing.boxes.items() if k < met}
+    if not boxes:
+        return None
+    before, after = thing.pose_near(thing.best_class, max(boxes)), twin.pose_near(twin.best_class, met)
+    if before is None or after is None or _in_one_place(before[0], after[0], thing, twin, model):
+        return None
+    own = judge(thing.object_id, boxes, {k: s for k, s in thing.sightings.items() if k < met}, recording, model)
+    return own if own.exists else None
 
 
 def _same(a: Thing, b: Thing, model: Model) -> bool:
     if not (a.exists and b.exists) or a.best_class != b.best_class:
         return False
-    shared = {k for k, p in zip(a.keyframes, a.presence, strict=True) if p > 0.5} & {
-        k for k, p in zip(b.keyframes, b.presence, strict=True) if p > 0.5
-    }
+    shared = _shared(a, b)
     if not shared:
         return False
-    k = sorted(shared)[len(shared) // 2]
+    k = shared[len(shared) // 2]
     T_a, T_b = a.pose_near(a.best_class, k), b.pose_near(b.best_class, k)
-    if T_a is None or T_b is None:
-        return False
-    apart = np.linalg.norm(T_a[0, :3, 3] - T_b[0, :3, 3])
+    return T_a is not None and T_b is not None and _in_one_place(T_a[0], T_b[0], a, b, model)
+
+
+def _shared(a: Thing, b: Thing) -> list[int]:
+    """Keyframes at which both are there, ascending."""
+    there = ({k for k, p in zip(t.keyframes, t.presence, strict=True) if p > 0.5} for t in (a, b))
+    return sorted(set.intersection(*there))
+
+
+def _in_one_place(T_a: Array, T_b: Array, a: Thing, b: Thing, model: Model) -> bool:
+    apart = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
     return bool(apart < one_place_m(model.shapes[a.best_class], model.shapes[b.best_class]))
 
 

@@ -32,7 +32,7 @@ from ctmap_gtsam.shapes import one_place_m
 from ctmap_gtsam.smoothing.association import Expected, assign
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera
-from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
+from ctmap_gtsam.smoothing.identity import duplicates, join_moved
 from ctmap_gtsam.smoothing.modes import Look, Recording, Sighting, Wanted, box_depths, in_world, look, sight
 from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
 from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, remembered
@@ -305,8 +305,7 @@ class _Walk:
 
     def _merge(self) -> None:
         """Two objects in one place are one for good: the surer one."""
-        things = self.things
-        for i in things.keys() - merge_duplicates(things, self.model).keys():
+        for i in duplicates(self.things, self.model):
             del self.objects[i]
             self.twins.add(i)
 

@@ -69,13 +69,17 @@ class Seed:
 
     def expected(self, keyframe: int) -> Array:
         """(4, 4) T_world_centre of the best class at a keyframe."""
-        return self._then(self.best_class, keyframe)[0]
+        return self._nearest(self.best_class, keyframe)[0]
 
     def starts(self, keyframe: int) -> dict[int, Array]:
         """Class index -> (n, 4, 4) T_world_centre to try at a keyframe: all, and what was believed then."""
-        return {c: np.concatenate([poses, self._then(c, keyframe)]) for c, poses in self.poses.items()}
+        return {c: np.concatenate([poses, self._nearest(c, keyframe)]) for c, poses in self.poses.items()}
 
-    def _then(self, c: int, keyframe: int) -> Array:
+    def then(self, c: int, keyframe: int) -> Array | None:
+        """(m, 4, 4) what was believed of a class at a keyframe; None where nothing was."""
+        return self.believed[c].get(keyframe)
+
+    def _nearest(self, c: int, keyframe: int) -> Array:
         """What was believed of a class at a keyframe, or next to it, the past first."""
         keyframes = sorted(self.believed[c])
         before = [k for k in keyframes if k <= keyframe]
@@ -96,7 +100,7 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
     """The objects of an estimate, by object id.
 
     Those that are still there at its end, or were taken away; and what was taken for another object in the end, or
-    given up, where no other object ever was: who is who is asked anew. So is who came back: an object that is of one
+    given up, where no other object was then: who is who is asked anew. So is who came back: an object that is of one
     class in a visit and of another in a later one may be two, and the second begins under an id of its own.
     """
     out: dict[int, Seed] = {}
@@ -135,12 +139,13 @@ def _lives(row: int, forward: Estimate) -> list[tuple[int, int]]:
 
 
 def _in_one_place(seed: Seed, other: Seed, model: Model) -> bool:
-    """Whether another object ever was where one was last."""
+    """Whether another object was where one was last, at that time."""
     at = seed.expected(seed.surest)[:3, 3]
     own = model.shapes[seed.best_class]
     return any(
         bool((np.linalg.norm(T[:, :3, 3] - at, axis=-1) < one_place_m(own, model.shapes[c])).any())
-        for c, T in other.poses.items()
+        for c in other.poses
+        if (T := other.then(c, seed.surest)) is not None
     )
 
 

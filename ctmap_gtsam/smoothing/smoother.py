@@ -205,7 +205,7 @@ def _solve(
 ) -> Map:
     """Trellis for every object, identities over gaps, then one graph."""
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
-    things = join_moved(merge_duplicates(things, model), recording, model)
+    things = join_moved(merge_duplicates(things, recording, model), recording, model)
     built, objects = _graph(recording, model, things)
     smoothed = smooth(built, model, objects, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
