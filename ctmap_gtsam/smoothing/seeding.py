@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,9 +75,9 @@ class Seed:
         """Class index -> (n, 4, 4) T_world_centre to try at a keyframe: all, and what was believed then."""
         return {c: np.concatenate([poses, self._nearest(c, keyframe)]) for c, poses in self.poses.items()}
 
-    def then(self, c: int, keyframe: int) -> Array | None:
-        """(m, 4, 4) what was believed of a class at a keyframe; None where nothing was."""
-        return self.believed[c].get(keyframe)
+    def then(self, keyframe: int) -> dict[int, Array]:
+        """Class index -> (m, 4, 4) T_world_centre believed at a keyframe."""
+        return {c: then[keyframe] for c, then in self.believed.items() if keyframe in then}
 
     def _nearest(self, c: int, keyframe: int) -> Array:
         """What was believed of a class at a keyframe, or next to it, the past first."""
@@ -99,9 +99,10 @@ def careful(poses: Mapping[int, Array], probability: Array) -> frozenset[int]:
 def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
     """The objects of an estimate, by object id.
 
-    Those that are still there at its end, or were taken away; and what was taken for another object in the end, or
-    given up, where no other object was then: who is who is asked anew. So is who came back: an object that is of one
-    class in a visit and of another in a later one may be two, and the second begins under an id of its own.
+    Those that are still there at its end, or were taken away. What was taken for one of them in the end is that one
+    from its own beginning on, since the filter learned late where it had gone. What was given up where no other object
+    was then begins anew, and so does who came back: an object that is of one class in a visit and of another in a later
+    one may be two, and the second has an id of its own.
     """
     out: dict[int, Seed] = {}
     let_go: list[Seed] = []
@@ -114,8 +115,12 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
                 out[i] = _seed(i, row, forward, model, first, end)
         elif forward.existence[row].max() > EXISTS:
             let_go.append(_seed(int(object_id), row, forward, model, 0, last + 1))
-    for seed in let_go:
-        if not any(_in_one_place(seed, other, model) for other in out.values()):
+    # the last first: what was taken for what was taken for an object is that object
+    for seed in sorted(let_go, key=lambda s: (-s.surest, s.object_id)):
+        heir = next((i for i, other in sorted(out.items()) if _stands_at(other, seed, seed.surest + 1, model)), None)
+        if heir is not None:
+            out[heir] = _begun_as(out[heir], seed, model)
+        elif not any(_stands_at(other, seed, seed.surest, model) for other in out.values()):
             out[seed.object_id] = seed
     return dict(sorted(out.items()))
 
@@ -138,15 +143,25 @@ def _lives(row: int, forward: Estimate) -> list[tuple[int, int]]:
     return list(itertools.pairwise([*begun, len(forward.keyframe_frame)]))
 
 
-def _in_one_place(seed: Seed, other: Seed, model: Model) -> bool:
-    """Whether another object was where one was last, at that time."""
+def _stands_at(other: Seed, seed: Seed, keyframe: int, model: Model) -> bool:
+    """Whether an object is believed at a keyframe to be where another was last."""
     at = seed.expected(seed.surest)[:3, 3]
     own = model.shapes[seed.best_class]
     return any(
         bool((np.linalg.norm(T[:, :3, 3] - at, axis=-1) < one_place_m(own, model.shapes[c])).any())
-        for c in other.poses
-        if (T := other.then(c, seed.surest)) is not None
+        for c, T in other.then(keyframe).items()
     )
+
+
+def _begun_as(seed: Seed, other: Seed, model: Model) -> Seed:
+    """An object, with what was believed of the one that was taken for it, while that was elsewhere."""
+    apart = [k for k in np.flatnonzero(other.there).tolist() if not _stands_at(seed, other, k, model)]
+    believed = {c: {k: T for k, T in then.items() if k not in apart} for c, then in seed.believed.items()}
+    for c, then in other.believed.items():
+        believed[c] = believed.get(c, {}) | {k: T for k, T in then.items() if k in apart}
+    believed = {c: then for c, then in believed.items() if then}
+    poses = {c: T for c, T in remembered(model, seed.poses, other.poses).items() if c in believed}
+    return replace(seed, poses=poses, believed=believed, there=seed.there | other.there)
 
 
 def _seed(object_id: int, row: int, forward: Estimate, model: Model, first: int, end: int) -> Seed:

@@ -72,7 +72,7 @@ def test_what_is_of_another_class_in_a_later_visit_may_be_another_thing(run):
     assert sorted(seeds(vanished, MODEL)) == [10]
 
 
-def test_what_was_joined_is_asked_anew_where_nothing_else_ever_was(run):
+def test_what_was_given_up_begins_anew_where_nothing_else_was(run):
     joined = [("mug", HERE, 0.9)] * 3 + [None] * 3
     apart = [None] * 3 + [("mug", THERE, 0.9)] * 3
     twin = [("bowl", HERE, 0.9)] * KEYFRAMES
@@ -80,6 +80,27 @@ def test_what_was_joined_is_asked_anew_where_nothing_else_ever_was(run):
     assert sorted(seeds(forward(run, joined, apart), MODEL)) == [10, 11]
     assert sorted(seeds(forward(run, joined, twin), MODEL)) == [11]
     assert sorted(seeds(forward(run, never, apart), MODEL)) == [11]
+
+
+def test_what_was_found_again_was_there_from_its_own_beginning_on(run):
+    """The filter holds an object to its old place until that is seen empty; the new one was begun before that."""
+    old = [("mug", HERE, 0.9)] * 4 + [("mug", THERE, 0.9)] * 2
+    found = [None] * 2 + [("mug", THERE, 0.9)] * 2 + [None] * 2
+    for stories in ((old, found), (found, old)):
+        (seed,) = seeds(forward(run, *stories), MODEL).values()
+        assert seed.object_id == 10 + stories.index(old)
+        for k in range(KEYFRAMES):
+            np.testing.assert_allclose(seed.expected(k), HERE if k < 2 else THERE, atol=1e-12)
+
+
+def test_what_was_found_again_by_way_of_another_is_the_first(run):
+    old = [("mug", HERE, 0.9)] * 5 + [("mug", THERE, 0.9)]
+    second = [None] * 3 + [("mug", THERE, 0.9)] * 2 + [None]
+    third = [None] + [("mug", THERE, 0.9)] * 2 + [None] * 3
+    (seed,) = seeds(forward(run, third, second, old), MODEL).values()
+    assert seed.object_id == 12
+    for k in range(KEYFRAMES):
+        np.testing.assert_allclose(seed.expected(k), HERE if k < 1 else THERE, atol=1e-12)
 
 
 def test_neighbours_in_the_first_round_are_those_that_were_there_then(run):
