@@ -119,7 +119,8 @@ class Model:
     def log_likelihood(self, scores: Scores, detection: Detection | None, image_size: tuple[int, int]) -> Array:
         """log phi_m (K,) of rendered hypotheses but for the class scores: tempered depth and the box, nats.
 
-        A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1).
+        A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1), but that a box of its
+        track's own would then be something else's.
         """
         boxes = None
         if detection is not None:

@@ -298,29 +298,6 @@ def correlated_pixels_of(products: ArrayLike, most: float) -> float:
     return float(np.clip(total / power, 1.0, most))
 
 
-def detection_log_ratio(
-    p_detect: ArrayLike,
-    visible_fraction: ArrayLike,
-    box_log_ratios: ArrayLike,
-    class_log_ratios: ArrayLike,
-    clutter_per_image: float = 1.0,
-) -> Array:
-    """log[(1 - p_D v) + p_D v sum_k l_k p(s_k | c) / p(s_k | clutter) / clutter_per_image] in nats.
-
-    Args:
-        p_detect: (...) p_D of the object's class, in full view.
-        visible_fraction: (...) v, the share of its silhouette in view and not occluded: 0 gives 0 nats.
-        box_log_ratios: (..., K) from `box_log_ratio`; K may be 0.
-        class_log_ratios: (..., K) from `class_log_ratio`, at the object's class.
-        clutter_per_image: false detections expected an image, > 0.
-    """
-    seen = np.asarray(p_detect, dtype=np.float64) * np.asarray(visible_fraction, dtype=np.float64)
-    each = np.asarray(box_log_ratios, dtype=np.float64) + np.asarray(class_log_ratios, dtype=np.float64)
-    with np.errstate(divide="ignore"):
-        found = np.log(seen) + log_sum(each) - np.log(clutter_per_image)
-        return np.logaddexp(np.log1p(-seen), found)
-
-
 def box_iou(a: ArrayLike, b: ArrayLike) -> Array:
     """Intersection over union (...) of boxes (..., 4), COCO xywh; 0 where both are empty."""
     intersection, area_a, area_b = _overlap(a, b)

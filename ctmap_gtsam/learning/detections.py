@@ -128,7 +128,9 @@ class DetectorStatistics:
 
         def off(log_sigma: float) -> float:
             detected, true = self._boxes[:, 0], self._boxes[:, 1]
-            matched = box_log_ratio(detected, true, float(np.exp(log_sigma)), (self._size[0], self._size[1]))
+            # images may differ in size: a false alarm's density is that of a unit image over each one's area
+            matched = box_log_ratio(detected, true, float(np.exp(log_sigma)), (1.0, 1.0))
+            matched = matched + 2.0 * np.log(self._size[0] * self._size[1])
             return -float(
                 by_sight[self._found] @ np.logaddexp(np.log1p(-self._outlier) + matched, np.log(self._outlier))
             )

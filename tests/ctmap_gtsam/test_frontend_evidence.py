@@ -84,15 +84,16 @@ def test_a_detector_without_opinion_says_nothing_of_the_class():
     np.testing.assert_allclose(evidence, evidence[0], atol=1e-12)
 
 
-def test_out_of_view_is_no_evidence():
+def test_out_of_view_is_no_evidence_but_for_a_box_of_its_own():
+    """Which then has nothing to do with it."""
     shape = MODEL.shapes[0]
     observation = view_of(MODEL, [(shape, standing(shape))], looking())
     detection = observation.frame.detections[0]
     proposer = Proposer(MODEL)
     far = se3.make(np.eye(3), np.array([5.0, 0.0, 1.0]))[None]
-    for seen in (None, detection):
+    for seen, nats in ((None, 0.0), (detection, np.log(MODEL.config.detector.box_outlier))):
         view = proposer.view(observation, np.array(detection.box), seen)
-        assert proposer.score(shape, view, far)[0][0] == pytest.approx(0.0, abs=1e-12)
+        assert proposer.score(shape, view, far)[0][0] == pytest.approx(nats, abs=1e-12)
 
 
 def test_a_missed_detection_costs_what_the_visible_share_makes_of_it():

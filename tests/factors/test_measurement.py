@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 
@@ -98,33 +98,6 @@ def test_a_common_bias_makes_an_image_one_measurement():
 def test_nothing_compared_is_an_error():
     with pytest.raises(ValueError, match="finite"):
         measurement.correlated_pixels(np.full((4, 4), np.nan))
-
-
-LOG_RATIOS = st.lists(st.tuples(st.floats(-20, 8), st.floats(-5, 5)), max_size=5)
-
-
-@given(st.floats(0, 1), st.floats(0, 1), LOG_RATIOS, st.floats(0.05, 5))
-def test_detections_are_a_clutter_model(p_detect, visible, ratios, clutter):
-    assume(p_detect * visible < 1.0 or ratios)
-    pairs = np.array(ratios).reshape(-1, 2)
-    value = measurement.detection_log_ratio(p_detect, visible, pairs[:, 0], pairs[:, 1], clutter)
-    seen = p_detect * visible
-    assert np.exp(value) == pytest.approx(1 - seen + seen * np.exp(pairs.sum(axis=1)).sum() / clutter)
-    shuffled = measurement.detection_log_ratio(p_detect, visible, pairs[::-1, 0], pairs[::-1, 1], clutter)
-    assert shuffled == pytest.approx(value)
-    assert measurement.detection_log_ratio(p_detect, 0.0, pairs[:, 0], pairs[:, 1], clutter) == 0.0
-
-
-def test_leaving_the_box_is_not_rewarded():
-    """An object in full view loses with its outline's distance from the only detection, down to a missed one."""
-    boxes = np.array([[100.0 + d, 80.0, 60.0, 40.0] for d in (0, 2, 5, 20, 200)])
-    ratios = measurement.box_log_ratio([100.0, 80, 60, 40], boxes, 0.05, (640, 480))[:, None]
-    values = measurement.detection_log_ratio(0.9, 1.0, ratios, np.zeros(1))
-    missed = measurement.detection_log_ratio(0.9, 1.0, np.zeros(0), np.zeros(0))
-    assert np.all(np.diff(values) < 0)
-    assert values[0] > 3
-    assert np.all(values >= missed)
-    assert values[-1] == pytest.approx(missed, abs=1e-3)
 
 
 BOXES = st.tuples(st.floats(0, 500), st.floats(0, 300), st.floats(1, 200), st.floats(1, 200)).map(np.array)
