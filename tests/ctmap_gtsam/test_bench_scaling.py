@@ -10,7 +10,7 @@ from ctmap_gtsam.bench import run_bench
 from ctmap_gtsam.bench.scaling import filter as scaling_filter
 from ctmap_gtsam.bench.scaling import smooth as scaling_smooth
 from ctmap_gtsam.bench.scaling.loop import looped, write_loop
-from ctmap_gtsam.bench.scaling.measuring import Measured, measure, peak_mb, with_particles
+from ctmap_gtsam.bench.scaling.measuring import FORWARD, Measured, measure, peak_mb, with_particles
 from ctmap_gtsam.bench.scaling.sizes import QUICK
 from sequences.bop import load_run
 from tests.ctmap_gtsam.scenes import CHEAP, config_of
@@ -53,21 +53,22 @@ def test_the_seed_decides_the_round(loop, tmp_path):
     assert load_run(tmp_path / "other").fingerprint != first
 
 
-def test_a_process_of_its_own_is_measured(loop, tmp_path):
-    measured = measure("filter", loop, 6, with_particles(CONFIG, 40), tmp_path / "forward.npz")
+def test_a_process_of_its_own_is_measured(loop):
+    measured = measure("filter", loop, 6, with_particles(CONFIG, 40))
     assert len(measured.each_s) == 6
     assert 0.0 < sum(measured.each_s) <= measured.seconds
     assert 50.0 < measured.peak_mb < 10 * peak_mb()
     assert measured.objects >= 1
-    after = measure("smooth", loop, 6, with_particles(CONFIG, 40), tmp_path / "forward.npz")
+    after = measure("smooth", loop, 6, with_particles(CONFIG, 40))
     assert after.seconds > 0.0
     assert 1 <= after.objects <= measured.objects
 
 
-def pretended(method, folder, keyframes, config, forward):
+def pretended(method, folder, keyframes, config):
     """A machine on which a keyframe takes 0.1 s, the first ten 1 s, the smoother twice that, and memory grows."""
     each = tuple([1.0] * min(keyframes, 10) + [0.1] * (keyframes - 10))
     assert folder.is_dir()
+    forward = folder / FORWARD
     assert method == "filter" or forward.read_text() == f"{keyframes}"
     forward.write_text(f"{keyframes}")
     return Measured(sum(each) * (2.0 if method == "smooth" else 1.0), each, 100.0 + keyframes, 1)

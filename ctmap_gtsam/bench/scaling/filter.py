@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctmap_gtsam.bench.scaling.measuring import Measured, measure, with_particles
-from ctmap_gtsam.bench.scaling.sizes import FORWARD, FULL, Sizes, by_length, loops
+from ctmap_gtsam.bench.scaling.sizes import FULL, Sizes, by_length, loops
 from ctmap_gtsam.config import Config
 from sequences.progress import SILENT, Progress
 
@@ -25,22 +25,20 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
     steps = len(sizes.objects) + len(sizes.particles) + 2
     with loops(objects, sizes.round_frames, config.seed, progress) as paths, progress.stage("filter", steps) as stage:
         for n in sizes.objects:
-            seen = measure("filter", paths[n], sizes.keyframes, config, paths[n] / FORWARD)
+            seen = measure("filter", paths[n], sizes.keyframes, config)
             begun = 2 * config.frontend.start_after
             figures[f"filter.keyframes_per_s_{n}_objects"] = 1.0 / float(np.mean(seen.each_s[begun:]))
             figures[f"filter.start_s_{n}_objects"] = float(np.sum(seen.each_s[:begun]))
             figures[f"filter.found_{n}_objects"] = float(seen.objects)
             stage.advance()
         for m in sizes.particles:
-            path = paths[sizes.middle]
-            seen = measure("filter", path, sizes.keyframes, with_particles(config, m), path / FORWARD)
+            seen = measure("filter", paths[sizes.middle], sizes.keyframes, with_particles(config, m))
             begun = 2 * config.frontend.start_after
             figures[f"filter.keyframes_per_s_{m}_particles"] = 1.0 / float(np.mean(seen.each_s[begun:]))
             stage.advance()
         both = []
         for length in sizes.lengths:
-            path = paths[sizes.length_objects]
-            both.append(measure("filter", path, length, config, path / FORWARD))
+            both.append(measure("filter", paths[sizes.length_objects], length, config))
             stage.advance()
     short, long = both
     figures |= by_length("filter", _cost(short, sizes.lengths[0]), _cost(long, sizes.lengths[1]), sizes.lengths)

@@ -24,6 +24,9 @@ from sequences.bop import load_run
 METHODS: dict[str, Callable[..., Estimate]] = {"filter": filter_run, "smooth": smooth_run}
 """the smoother takes the filter's estimate, too"""
 
+FORWARD = "filter-ct.npz"
+"""beside a round: what the filter said last, for the smoother to begin with"""
+
 WARM = 4  # keyframes of a first run, which loads kernels and builds what is built once
 
 
@@ -41,22 +44,21 @@ class Measured:
     """in the estimate"""
 
 
-def measure(method: str, folder: Path, keyframes: int, config: Config, forward: Path) -> Measured:
+def measure(method: str, folder: Path, keyframes: int, config: Config) -> Measured:
     """Run an estimator on so many keyframes of a loop, in a fresh process.
 
     Args:
         method: "filter" or "smooth".
-        folder: one round, by `loop.write_loop`.
+        folder: one round, by `loop.write_loop`. The filter leaves its estimate there, and the smoother begins from it.
         keyframes: of the run.
         config: settings.
-        forward: the file in which the filter leaves its estimate, and from which the smoother begins.
 
     Raises:
         RuntimeError: the process died.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(there, method, folder, keyframes, config, forward))
+    process = context.Process(target=_work, args=(there, method, folder, keyframes, config))
     process.start()
     there.close()
     try:
@@ -69,12 +71,12 @@ def measure(method: str, folder: Path, keyframes: int, config: Config, forward: 
         process.join()
 
 
-def _work(connection: Connection, method: str, folder: Path, keyframes: int, config: Config, forward: Path) -> None:
+def _work(connection: Connection, method: str, folder: Path, keyframes: int, config: Config) -> None:
     round_, smooth = load_run(folder), method == "smooth"
     warm = filter_run(looped(round_, WARM), config)
     if smooth:
         smooth_run(looped(round_, WARM), warm, config)
-    given = (Estimate.load(forward),) if smooth else ()
+    given = (Estimate.load(folder / FORWARD),) if smooth else ()
     run, estimator = looped(round_, keyframes), METHODS[method]
     clock = _Clock()
     estimate = estimator(run, *given, config, progress=clock)
@@ -82,7 +84,7 @@ def _work(connection: Connection, method: str, folder: Path, keyframes: int, con
     each = tuple(float(s) for s in np.diff([clock.began, *clock.ticks]))
     measured = Measured(seconds, each, peak_mb(), len(estimate.object_id))
     if not smooth:
-        estimate.save(forward)
+        estimate.save(folder / FORWARD)
     connection.send(measured)
 
 

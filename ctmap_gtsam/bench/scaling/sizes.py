@@ -33,9 +33,6 @@ class Sizes:
         return min(self.objects, key=lambda n: (abs(n - 10), n))
 
 
-FORWARD = "filter-ct.npz"
-"""beside a round: what the filter said last, for the smoother to begin with"""
-
 FULL = Sizes((5, 10, 20, 40), (100, 300, 1000), (100, 2000), 5, 40)
 QUICK = Sizes((2, 5), (100, 300), (30, 120), 2, 15, round_frames=30)
 

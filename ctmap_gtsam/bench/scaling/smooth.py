@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctmap_gtsam.bench.scaling.measuring import measure
-from ctmap_gtsam.bench.scaling.sizes import FORWARD, FULL, Sizes, by_length, loops
+from ctmap_gtsam.bench.scaling.sizes import FULL, Sizes, by_length, loops
 from ctmap_gtsam.config import Config
 from sequences.progress import SILENT, Progress
 
@@ -23,15 +23,15 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
         for n in sizes.objects:
             seconds = {}
             for method in ("filter", "smooth"):
-                seconds[method] = measure(method, paths[n], sizes.keyframes, config, paths[n] / FORWARD).seconds
+                seconds[method] = measure(method, paths[n], sizes.keyframes, config).seconds
                 stage.advance()
             figures[f"smooth.seconds_per_keyframe_{n}_objects"] = seconds["smooth"] / sizes.keyframes
             figures[f"smooth.over_filter_{n}_objects"] = seconds["smooth"] / seconds["filter"]
         costs = []
         for length in sizes.lengths:
             path = paths[sizes.length_objects]
-            measure("filter", path, length, config, path / FORWARD)
-            seen = measure("smooth", path, length, config, path / FORWARD)
+            measure("filter", path, length, config)
+            seen = measure("smooth", path, length, config)
             costs.append((seen.seconds / length, seen.peak_mb))
             stage.advance()
     short, long = costs
