@@ -2,12 +2,14 @@
 
 One sample an object-visit, at its end, since frames of one visit share their errors.
 
-Poses: the normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
-Tracking and Navigation, 2001, section 5.4) of T_world_object, ``r' C^-1 r`` with ``r = log(inv(T) T_true S)`` at the
-symmetry S where it is least. Directions that a symmetry or the data leave free (the mode's `free_axes`) are projected
-away; d directions remain, and the NEES of a calibrated method is chi-square with d degrees of freedom. Only samples of
-the true class count, by the mode that the metrics take for *the* pose. The world frame is the truth's, since that is
-where covariances are given, so an error of the localisation counts.
+Poses: what is believed of T_world_object is a mixture, the modes of the true class, each a Gaussian of
+``r = log(inv(T) T_true S)`` at the symmetry S where ``r' C^-1 r`` is least. Directions that a symmetry or the data
+leave free (a mode's `free_axes`) are projected away; d directions remain. Coverage asks whether the truth lies in the
+smallest region that holds a share of that belief (its highest-density region; Hyndman 1996), which for a single mode
+is its ellipsoid. The normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
+Tracking and Navigation, 2001, section 5.4) is of the mode that the metrics take for *the* pose, with the mixture's
+covariance about it (section 11.6 there), and has mean d if calibrated. Only samples of the true class count. The world
+frame is the truth's, since that is where covariances are given, so an error of the localisation counts.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
 from ctmap_gtsam.evaluation.statistics import log_score, mean
 from ctmap_gtsam.evaluation.visits import ends, last_frames
-from factors.symmetry import Symmetry, residual
+from factors.symmetry import Symmetry, nearest_image, residual
+from sequences import se3
 from sequences.catalogue import Catalogue
 from sequences.types import Run, Truth
 
@@ -33,7 +36,7 @@ Bools = NDArray[np.bool_]
 LEVELS = {"coverage_50": 0.5, "coverage_80": 0.8, "coverage_95": 0.95}
 
 POSE_CALIBRATION = (*LEVELS, "anees")
-"""coverage_*: share of the true poses in the ellipsoid that should hold so many. anees: average NEES over degrees of
+"""coverage_*: share of the true poses in the region that should hold so many. anees: average NEES over degrees of
 freedom, 1 for a calibrated method, more for one that is too sure"""
 
 EXISTENCE = ("existence_log_score", "existence_brier_score")
@@ -50,6 +53,8 @@ class PoseSamples:
     """(n,)"""
     freedom: Ints
     """(n,) degrees of freedom, 3 to 6"""
+    mass: Array
+    """(n,) of the belief, what is more probable than the truth: uniform on 0 to 1 if calibrated"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ def pose_samples(run: Run, method: MethodMap, truth: Truth, objects: ObjectFrame
             rows.append(_sample(method.estimate, int(row), int(method.held[final[v]]), T_true, run.catalogue))
     rows = [r for r in rows if r[1] > 0]
     return PoseSamples(
-        nees=np.array([r[0] for r in rows], dtype=np.float64), freedom=np.array([r[1] for r in rows], dtype=np.int64)
+        nees=np.array([r[0] for r in rows], dtype=np.float64),
+        freedom=np.array([r[1] for r in rows], dtype=np.int64),
+        mass=np.array([r[2] for r in rows], dtype=np.float64),
     )
 
 
@@ -88,12 +95,44 @@ def nees(T: Array, covariance: Array, free_axes: Array, T_true: Array, symmetry:
         T_true: (4, 4).
         symmetry: of the object; what it leaves free is taken away, too.
     """
-    span, size, _ = np.linalg.svd(np.concatenate([free_axes, symmetry.free_axes], axis=1))
-    basis = span[:, int((size > 1e-6).sum()) :]  # (6, d)
+    basis = _held(free_axes, symmetry)
     weight = np.linalg.inv(basis.T @ covariance @ basis + _FLOOR * np.eye(basis.shape[1]))
-    lines = Symmetry(axes=symmetry.axes, offsets=symmetry.offsets)
-    twins = residual(T, T_true @ symmetry.discrete, lines) @ basis  # (S, d)
+    twins = residual(T, T_true @ symmetry.discrete, _lines(symmetry)) @ basis  # (S, d)
     return float(np.einsum("si,ij,sj->s", twins, weight, twins).min()), basis.shape[1]
+
+
+def denser_mass(
+    log_weight: Array, T: Array, covariance: Array, free_axes: Array, T_true: Array, symmetry: Symmetry
+) -> float:
+    """How much of a belief is more probable than the truth: 0 at its peak, near 1 far from all modes.
+
+    Modes are taken for apart, each with a density of its own: where they overlap they are counted one by one.
+
+    Args:
+        log_weight: (n,) of the modes; need not be normalised.
+        T: (n, 4, 4).
+        covariance: (n, 6, 6) of their right tangents.
+        free_axes: (n, 6, f) as in `nees`.
+        T_true: (4, 4).
+        symmetry: of the object.
+    """
+    held = _held(np.zeros((6, 0)), symmetry)
+    log_peak = log_weight - 0.5 * np.linalg.slogdet(held.T @ covariance @ held + _FLOOR * np.eye(held.shape[1]))[1]
+    samples = [nees(*mode, T_true, symmetry) for mode in zip(T, covariance, free_axes, strict=True)]
+    distance, freedom = np.array([d for d, _ in samples]), np.array([f for _, f in samples])
+    here = np.max(log_peak - 0.5 * distance)
+    inside = chi2.cdf(2.0 * np.maximum(log_peak - here, 0.0), np.maximum(freedom, 1))
+    return float(np.average(inside, weights=np.exp(log_weight - log_weight.max())))
+
+
+def spread_about(best: int, log_weight: Array, T: Array, covariance: Array, symmetry: Symmetry) -> Array:
+    """The second moment (6, 6) of a belief about one of its modes, in that one's right tangent; arrays as above."""
+    g = nearest_image(np.broadcast_to(T[best], T.shape), T, symmetry)
+    r = residual(np.broadcast_to(T[best], T.shape), g, _lines(symmetry))
+    turn = se3.adjoint(se3.inverse(T[best]) @ g)
+    weight = np.exp(log_weight - log_weight.max())
+    moments = turn @ covariance @ np.swapaxes(turn, -1, -2) + r[:, :, None] * r[:, None, :]
+    return np.asarray(np.average(moments, axis=0, weights=weight))
 
 
 def existence_samples(run: Run, method: MethodMap, objects: ObjectFrames, matching: Matching) -> ExistenceSamples:
@@ -118,7 +157,7 @@ def existence_samples(run: Run, method: MethodMap, objects: ObjectFrames, matchi
 def pose_calibration_metrics(samples: PoseSamples) -> dict[str, float | None]:
     """POSE_CALIBRATION over object-visits."""
     some = len(samples.nees) > 0
-    inside = {name: samples.nees <= chi2.ppf(level, samples.freedom) for name, level in LEVELS.items()}
+    inside = {name: samples.mass <= level for name, level in LEVELS.items()}
     anees = float(samples.nees.sum() / samples.freedom.sum()) if some else np.inf
     return {**{name: mean(share) for name, share in inside.items()}, "anees": anees if np.isfinite(anees) else None}
 
@@ -132,7 +171,23 @@ def existence_metrics(samples: ExistenceSamples) -> dict[str, float | None]:
     }
 
 
-def _sample(estimate: Estimate, row: int, k: int, T_true: Array, catalogue: Catalogue) -> tuple[float, int]:
-    mode = int(estimate.best_mode[row, k])
-    free_axes, symmetry = estimate.modes.free_axes[mode], Symmetry.of(catalogue[int(estimate.modes.class_id[mode])])
-    return nees(estimate.modes.T_world_object[mode], estimate.modes.covariance[mode], free_axes, T_true, symmetry)
+def _sample(estimate: Estimate, row: int, k: int, T_true: Array, catalogue: Catalogue) -> tuple[float, int, float]:
+    """NEES, degrees of freedom and `denser_mass`."""
+    m, best = estimate.modes, int(estimate.best_mode[row, k])
+    rows = np.flatnonzero((m.object == row) & (m.keyframe == k) & (m.class_id == m.class_id[best]))
+    symmetry = Symmetry.of(catalogue[int(m.class_id[best])])
+    belief = m.log_weight[rows], m.T_world_object[rows], m.covariance[rows]
+    covariance = spread_about(int(np.flatnonzero(rows == best)[0]), *belief, symmetry)
+    error, freedom = nees(m.T_world_object[best], covariance, m.free_axes[best], T_true, symmetry)
+    return error, freedom, denser_mass(*belief, m.free_axes[rows], T_true, symmetry)
+
+
+def _held(free_axes: Array, symmetry: Symmetry) -> Array:
+    """Orthonormal columns (6, d) of the directions that neither a symmetry nor free axes (6, f) leave free."""
+    span, size, _ = np.linalg.svd(np.concatenate([free_axes, symmetry.free_axes], axis=1))
+    return np.asarray(span[:, int((size > 1e-6).sum()) :])
+
+
+def _lines(symmetry: Symmetry) -> Symmetry:
+    """Its free axes alone."""
+    return Symmetry(axes=symmetry.axes, offsets=symmetry.offsets)

@@ -45,7 +45,7 @@ from sequences.types import Run, Truth
 
 Array = NDArray[np.float64]
 
-SCHEMA = 1
+SCHEMA = 2
 
 DETECTOR = "detector"
 """Name of the method that is the recorded boxes, which have no poses"""

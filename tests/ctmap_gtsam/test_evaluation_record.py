@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
 from ctmap_gtsam.estimate import Estimate, Moves
 from ctmap_gtsam.evaluation import Record, compare, pooled, pose_curve, record, truth_estimate
-from ctmap_gtsam.evaluation.calibration import nees
+from ctmap_gtsam.evaluation.calibration import denser_mass, nees, spread_about
 from ctmap_gtsam.evaluation.identity import identity_switches
 from ctmap_gtsam.evaluation.matching import ObjectFrames, shapes_of
 from ctmap_gtsam.evaluation.record import METRICS
@@ -423,6 +424,35 @@ def test_a_calibrated_estimate_has_chi_square_errors(name):
         values.append(value)
     assert np.mean(values) == pytest.approx(freedom, rel=0.08)
     assert np.var(values) == pytest.approx(2 * freedom, rel=0.25)
+
+
+@pytest.mark.parametrize("name", SYMMETRIES)
+def test_truths_drawn_from_several_modes_are_spread_evenly_over_the_belief(name):
+    """Of a calibrated mixture the mass denser than the truth is uniform, and NEES about one mode has mean d."""
+    symmetry, freedom = SYMMETRIES[name]
+    rng = np.random.default_rng(1)
+    weight = np.array([0.6, 0.3, 0.1])
+    T = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.5, 0.05], 3))
+    roots = 1e-3 * rng.normal(size=(3, 6, 6)) + 1e-3 * np.eye(6)
+    covariance = roots @ np.swapaxes(roots, -1, -2)
+    free = np.zeros((3, 6, 3))
+    about = spread_about(0, np.log(weight), T, covariance, symmetry)
+    mass, errors = [], []
+    for _ in range(800):
+        k = rng.choice(3, p=weight)
+        spin = se3.exp(symmetry.generators @ rng.normal(size=symmetry.free)) if symmetry.free else np.eye(4)
+        T_true = T[k] @ se3.exp(roots[k] @ rng.normal(size=6)) @ spin
+        mass.append(denser_mass(np.log(weight) + 3.0, T, covariance, free, T_true, symmetry))
+        errors.append(nees(T[0], about, free[0], T_true, symmetry)[0])
+    for level in (0.25, 0.5, 0.8, 0.95):
+        assert np.mean(np.array(mass) <= level) == pytest.approx(level, abs=0.05)
+    assert np.mean(errors) == pytest.approx(freedom, rel=0.15)
+
+
+def test_of_one_mode_the_denser_mass_is_that_of_its_ellipsoid():
+    covariance, T_true = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0, 0.003, 0, 0]))
+    found = denser_mass(np.zeros(1), np.eye(4)[None], covariance[None], np.zeros((1, 6, 3)), T_true, Symmetry())
+    assert found == pytest.approx(chi2.cdf(9.0, 6), rel=1e-5)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 10.0))
