@@ -2,14 +2,15 @@
 
 One sample an object-visit, at its end, since frames of one visit share their errors.
 
-Poses: what is believed of T_world_object is a mixture, the modes of the true class, each a Gaussian of
-``r = log(inv(T) T_true S)`` at the symmetry S where ``r' C^-1 r`` is least. Directions that a symmetry or the data
-leave free (a mode's `free_axes`) are projected away; d directions remain. Coverage asks whether the truth lies in the
+Poses: what is believed of T_world_object is a mixture, the modes of the true class, each a Gaussian of ``r =
+log(inv(T) T_true S)`` at the symmetry S where ``r' C^-1 r`` is least. Directions that a symmetry or the data leave
+free (a mode's `free_axes`) are projected away; d directions remain. Coverage asks whether the truth lies in the
 smallest region that holds a share of that belief (its highest-density region; Hyndman 1996), which for a single mode
-is its ellipsoid. The normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
-Tracking and Navigation, 2001, section 5.4) is of the mode that the metrics take for *the* pose, with the mixture's
-covariance about it (section 11.6 there), and has mean d if calibrated. Only samples of the true class count. The world
-frame is the truth's, since that is where covariances are given, so an error of the localisation counts.
+is its ellipsoid. The normalised estimation error squared (NEES; Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, section 5.4) is of the mode that the metrics take for *the* pose, with
+the mixture's covariance about it (section 11.6 there), and has mean d if calibrated. Only samples of the true class
+count. The world frame is the truth's, since that is where covariances are given, so an error of the localisation
+counts.
 """
 
 from __future__ import annotations
