@@ -29,7 +29,7 @@ _ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
 _ONE_FLAT_M = 0.01  # triangles of one flat lie so near to one plane ...
 _FLAT_SHARE = 0.02  # ... and make up this share of the surface together
 _ONE_PLACE = 0.5  # of the smaller thing's radius
-_TWIN = 0.05  # a turn that moves the surface off itself by less than this share of the radius is a near-symmetry ...
+NEARLY = 0.05  # a turn that moves the surface off itself by less than this share of the radius is a near-symmetry ...
 _TWINS = 3  # ... of which so many are told at most
 _SAME_RAD = 0.1  # turns so near to each other are one
 _TWIN_POINTS = 1000
@@ -128,7 +128,7 @@ class Shape:
             T = se3.make(_TURNS[k], np.zeros(3))
             there = se3.make(np.stack(kept), np.zeros((len(kept), 3)))
             apart = np.linalg.norm(residual(there, T, self.symmetry)[..., :3], axis=-1).min()
-            if off[k] < _TWIN and apart > _SAME_RAD and len(kept) <= _TWINS:
+            if off[k] < NEARLY and apart > _SAME_RAD and len(kept) <= _TWINS:
                 kept.append(_TURNS[k])
         return np.stack(kept)[1:]
 

@@ -29,6 +29,7 @@ from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import one_place_m
+from ctmap_gtsam.smoothing.alternatives import exchanges
 from ctmap_gtsam.smoothing.association import Expected, assign
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera
@@ -38,7 +39,7 @@ from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, 
 from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, remembered
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
-from ctmap_gtsam.smoothing.writing import note_class, write_at
+from ctmap_gtsam.smoothing.writing import Told, note_class, write_at
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
@@ -355,6 +356,7 @@ class _Walk:
         return out
 
     def _write(self, keyframe: int, things: Mapping[int, Thing]) -> None:
+        told = Told(self.recording, self.model, things, exchanges(things, self.recording, self.model))
         for i, thing in sorted(things.items()):
             if thing.reported_class not in thing.posteriors:
                 continue
@@ -362,7 +364,7 @@ class _Walk:
                 self.rows[i] = self.tables.grow()
                 note_class(self.tables, self.rows[i], thing)
             T = self.T_world_camera[keyframe]
-            write_at(self.tables, self.rows[i], keyframe, thing, self.recording, self.model, T)
+            write_at(self.tables, self.rows[i], keyframe, thing, told, T)
 
     def estimate(self, method: str) -> Estimate:
         """All that has been said."""

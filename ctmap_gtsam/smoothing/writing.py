@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
@@ -15,18 +15,17 @@ from ctmap_gtsam.frontend.proposer import FLAT_M
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
+from ctmap_gtsam.smoothing.alternatives import Exchanges, Mode, elsewhere, exchanges, leads, ways_round
 from ctmap_gtsam.smoothing.belief import Thing
 from ctmap_gtsam.smoothing.discrete import Stage
 from ctmap_gtsam.smoothing.graph import Smoothed
 from ctmap_gtsam.smoothing.modes import Recording
-from factors.symmetry import residual
 
 Array = NDArray[np.float64]
 
 _REPORTED = 1e-3  # modes and classes less probable than this are left out
 _MOST_FREE = 3  # columns that an Estimate has for free axes
 _LEAST = 1e-12  # weight of the reported pose, whatever rounding takes
-_SAME = 0.99  # of the scatter of one pose's views: a mode within it is no other pose
 
 
 def write(
@@ -34,10 +33,11 @@ def write(
 ) -> Estimate:
     """Every object at every keyframe: smoothed where measured, held between."""
     kept = [thing for _, thing in sorted(things.items()) if thing.reported_class in thing.posteriors]
+    told = Told(recording, model, things, exchanges(things, recording, model))
     tables = Tables(len(kept), len(recording.keyframes), len(model.catalogue))
     for row, thing in enumerate(kept):
         for k in range(len(recording.keyframes)):
-            write_at(tables, row, k, thing, recording, model, smoothed.T_world_camera[k])
+            write_at(tables, row, k, thing, told, smoothed.T_world_camera[k])
         note_class(tables, row, thing)
     return build_estimate(
         recording.run,
@@ -52,9 +52,17 @@ def write(
     )
 
 
-def write_at(
-    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model, T_world_camera: Array
-) -> None:
+@dataclass(frozen=True)
+class Told:
+    """What is written down beside the object in question."""
+
+    recording: Recording
+    model: Model
+    things: Mapping[int, Thing]
+    exchanges: Exchanges
+
+
+def write_at(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
     """All that is said of an object at a keyframe.
 
     Args:
@@ -62,42 +70,62 @@ def write_at(
         row: of the object.
         k: the keyframe.
         thing: the object.
-        recording: the run.
-        model: potentials.
+        told: the run, and the whole map.
         T_world_camera: (4, 4) smoothed.
     """
     tables.class_probability[row, k] = thing.class_probability
     tables.existence[row, k] = thing.solid * thing.presence_at(k)
-    _write_pose(tables, row, k, thing, recording, model, T_world_camera)
+    _write_pose(tables, row, k, thing, told, T_world_camera)
     if k in thing.sightings:
-        _write_move(tables, row, k, thing, recording, model.config.prediction.significant_period_s)
+        _write_move(tables, row, k, thing, told.recording, told.model.config.prediction.significant_period_s)
         _write_ledger(tables, row, k, thing)
 
 
-def _write_pose(
-    tables: Tables, row: int, k: int, thing: Thing, recording: Recording, model: Model, T_world_camera: Array
-) -> None:
-    held = thing.held(k)
-    if held is None:
+def _write_pose(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
+    own = _reported(thing, k, told)
+    if own is None:
         return
-    c, T = thing.reported_class, held.T_world_centre
+    recording, model, c = told.recording, told.model, thing.reported_class
     shape = model.shapes[c]
-    tables.in_view[row, k] = _share_in_view(shape, T, T_world_camera, recording, k) > 0.0
-    covariance = held.covariance
-    if not held.smoothed:
-        covariance = covariance + _shared(thing.stages[c][held.view], T, recording, model)
-    # the heaviest mode is the pose: what a single view takes for another one, within its own scatter, is none
-    weight = 1.0
-    for share, other, spread in _alternatives(thing, c, held.view, recording, model):
-        if _within(T, covariance, other, spread, shape):
-            continue
-        weight -= share
-        if share >= _REPORTED:
-            _write_mode(tables, row, k, shape, share, other, spread)
-    _write_mode(tables, row, k, shape, max(weight, _LEAST), T, covariance)
+    tables.in_view[row, k] = _share_in_view(shape, own.T_world_centre, T_world_camera, recording, k) > 0.0
+    for mode in _belief(thing, k, own, told):
+        if mode.share >= _REPORTED or mode.T_world_centre is own.T_world_centre:
+            _write_mode(tables, row, k, shape, mode)
     for other_class in thing.posteriors:
         if other_class != c and thing.class_probability[other_class] >= _REPORTED and k in thing.sightings:
             _write_class(tables, row, k, thing, other_class, recording, model)
+
+
+def _reported(thing: Thing, k: int, told: Told) -> Mode | None:
+    """The reported pose, which all of the belief is in at first; None where it has none."""
+    held = thing.held(k)
+    if held is None:
+        return None
+    covariance = held.covariance
+    if not held.smoothed:
+        stage = thing.stages[thing.reported_class][held.view]
+        covariance = covariance + _shared(stage, held.T_world_centre, told.recording, told.model)
+    return Mode(1.0, held.T_world_centre, covariance)
+
+
+def _belief(thing: Thing, k: int, own: Mode, told: Told) -> Iterator[Mode]:
+    """The modes of the reported class, the reported pose last: it is the heaviest of them."""
+    recording, model, c = told.recording, told.model, thing.reported_class
+    held = thing.held(k)
+    assert held is not None
+    # what a single view takes for another pose, within its own scatter, is none
+    seen = _alternatives(thing, c, held.view, recording, model)
+    others = [mode for mode in seen if not own.says_the_same(mode, model.shapes[c])]
+    own = replace(own, share=max(1.0 - sum(mode.share for mode in others), _LEAST))
+    visit = recording.run.frames[int(recording.keyframes[thing.keyframes[held.view]])].visit
+    lead = leads(thing, visit, own.T_world_centre, recording, model)
+    own, turned = ways_round(own, others, model.shapes[c], lead, model.config.smoother.surface_nats)
+    visit = recording.run.frames[int(recording.keyframes[k])].visit
+    shares = told.exchanges.at(thing.object_id, visit)
+    places = {i: _reported(told.things[i], k, told) for i in shares if told.things[i].presence_at(k) > 0.5}
+    own, modes = elsewhere(own, turned, shares, {i: mode for i, mode in places.items() if mode is not None})
+    yield from modes
+    yield own
 
 
 def _share_in_view(shape: Shape, T: Array, T_world_camera: Array, recording: Recording, k: int) -> float:
@@ -108,22 +136,26 @@ def _share_in_view(shape: Shape, T: Array, T_world_camera: Array, recording: Rec
 def _write_class(tables: Tables, row: int, k: int, thing: Thing, c: int, recording: Recording, model: Model) -> None:
     """The modes of a class that is still possible, as its own trellis weighs them."""
     i = thing.keyframes.index(k)
-    shares = thing.shares(c, i)
-    for state in np.flatnonzero(shares >= _REPORTED).tolist():
-        T = thing.stages[c][i].T_world_centre[state]
-        spread = thing.stages[c][i].covariance[state] + _shared(thing.stages[c][i], T, recording, model)
-        _write_mode(tables, row, k, model.shapes[c], shares[state], T, spread)
+    for mode in _modes(thing, c, i, recording, model):
+        if mode.share >= _REPORTED:
+            _write_mode(tables, row, k, model.shapes[c], mode)
 
 
-def _alternatives(
-    thing: Thing, c: int, i: int, recording: Recording, model: Model
-) -> Iterator[tuple[float, Array, Array]]:
-    """Share, pose (4, 4) and covariance (6, 6) of the modes of a view that the best path doesn't go through."""
-    stage, shares = thing.stages[c][i], thing.shares(c, i)
-    for state in range(len(shares)):
-        if state != thing.posteriors[c].path[i]:
-            T = stage.T_world_centre[state]
-            yield float(shares[state]), T, stage.covariance[state] + _shared(stage, T, recording, model)
+def _alternatives(thing: Thing, c: int, i: int, recording: Recording, model: Model) -> list[Mode]:
+    """The modes of a view that the best path doesn't go through."""
+    path = thing.posteriors[c].path[i]
+    return [mode for state, mode in enumerate(_modes(thing, c, i, recording, model)) if state != path]
+
+
+def _modes(thing: Thing, c: int, i: int, recording: Recording, model: Model) -> list[Mode]:
+    """The modes of class c at the i-th view, with all that a camera gets wrong in their covariances."""
+    stage = thing.stages[c][i]
+    return [
+        Mode(share, T, covariance + _shared(stage, T, recording, model))
+        for share, T, covariance in zip(
+            thing.shares(c, i).tolist(), stage.T_world_centre, stage.covariance, strict=True
+        )
+    ]
 
 
 def _shared(stage: Stage, T_world_centre: Array, recording: Recording, model: Model) -> Array:
@@ -132,25 +164,15 @@ def _shared(stage: Stage, T_world_centre: Array, recording: Recording, model: Mo
     return np.diag(model.shared_variance(recording.run.localisation, away))
 
 
-def _within(T: Array, covariance: Array, other: Array, spread: Array, shape: Shape) -> bool:
-    """Whether a view's mode says nothing else than the reported pose: it lies where that one's views scatter anyhow."""
-    S = shape.symmetry
-    r = S.projection @ residual(T, other, S)
-    d = float(r @ np.linalg.solve(S.reduced_covariance(covariance + spread), r))
-    return d <= float(chi2.ppf(_SAME, len(r)))
-
-
-def _write_mode(
-    tables: Tables, row: int, k: int, shape: Shape, share: float, T_world_centre: Array, covariance: Array
-) -> None:
+def _write_mode(tables: Tables, row: int, k: int, shape: Shape, mode: Mode) -> None:
     tables.mode(
         row,
         k,
         shape.source.obj_id,
-        float(np.log(share)),
-        shape.to_object(T_world_centre),
-        shape.covariance_to_object(covariance),
-        shape.free_axes_to_object(free_axes(shape, covariance)),
+        float(np.log(mode.share)),
+        shape.to_object(mode.T_world_centre),
+        shape.covariance_to_object(mode.covariance),
+        shape.free_axes_to_object(free_axes(shape, mode.covariance)),
     )
 
 

@@ -1,51 +1,12 @@
 """Laws of which objects are one over the whole run."""
 
 from itertools import permutations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from ctmap_gtsam.frontend.proposer import PoseModes
-from ctmap_gtsam.smoothing.belief import judge
 from ctmap_gtsam.smoothing.identity import duplicates, join_moved, merge_duplicates
-from ctmap_gtsam.smoothing.modes import Sighting
-from sequences import se3
-from sequences.types import Detection, LocalisationNoise
-from tests.ctmap_gtsam.scenes import model_of
-
-MODEL = model_of("mug")
-HERE, THERE = (se3.make(np.eye(3), np.array([x, 0.0, 0.8])) for x in (0.0, 0.6))
-DAY = 86400.0
-BOX = Detection((10.0, 10.0, 40.0, 40.0), np.array([0.1, 0.9]))
-SEEN, EMPTY = 60.0, -40.0
-"""log-likelihoods of a pose where the thing is, and where it should show and doesn't"""
-RECORDING = SimpleNamespace(
-    keyframes=np.arange(8),
-    run=SimpleNamespace(
-        frames=[SimpleNamespace(visit=k // 4) for k in range(8)], localisation=LocalisationNoise(1e-4, 1e-4)
-    ),
-    T_world_camera=lambda k: np.eye(4),
-    time_s=lambda k: (k // 4) * DAY + k,
-)
-"""two visits of four keyframes, a day apart"""
-
-
-def thing(object_id, *looks):
-    """An object of looks: keyframe, pose, nats; it has a box where it is seen."""
-    covariance = np.diag(np.repeat([1e-4, 1e-6], 3))[None]
-
-    def sighting(k, T, nats):
-        value = np.array([nats])
-        modes = PoseModes(T[None], value, value, covariance, np.array([2.0 if nats > 0 else -2.0]))
-        return Sighting(k, (modes,), (np.zeros(1),), 0.0)
-
-    boxes = {k: BOX for k, _, nats in looks if nats > 0}
-    return judge(object_id, boxes, {k: sighting(k, T, nats) for k, T, nats in looks}, RECORDING, MODEL)
-
-
-def stays(object_id, T, keyframes, nats=SEEN):
-    return thing(object_id, *((k, T, nats) for k in keyframes))
+from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, stays, thing
 
 
 def test_of_two_in_one_place_the_one_with_more_evidence_stays_in_any_order():

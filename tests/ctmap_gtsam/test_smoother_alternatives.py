@@ -1,0 +1,133 @@
+"""Laws of what else a pose may be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from ctmap_gtsam.smoothing.alternatives import Mode, elsewhere, exchanges, leads, ways_round
+from sequences import se3
+from tests.ctmap_gtsam.scenes import model_of, shape_named
+from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, stays, thing
+
+BANANA = shape_named(model_of("banana"), "banana")
+(TURN,) = se3.make(BANANA.near_symmetries, np.zeros((1, 3)))
+COVARIANCE = np.diag(np.repeat([1e-4, 1e-6], 3))
+POSE = se3.exp(np.array([0.3, -0.2, 1.0, 0.1, 0.2, 0.7]))
+APART = se3.make(np.eye(3), np.array([0.3, 0.0, 0.0]))
+
+
+def mode(share, T=POSE):
+    return Mode(share, T, COVARIANCE)
+
+
+def total(own, others):
+    return own.share + sum(m.share for m in others)
+
+
+# --- ways round ---
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(-3.0, 3.0))
+def test_what_depth_says_of_two_ways_round_goes_no_further_than_it_can_be_trusted(turned, apart, lead):
+    """The odds of the other way are those of all views together, or those of their mean against the surface's error."""
+    shares = np.array([1.0, turned, apart]) / (1.0 + turned + apart)
+    others = (mode(shares[1], POSE @ TURN), mode(shares[2], POSE @ APART))
+    own, found = ways_round(mode(shares[0]), others, BANANA, np.array([lead]), 0.3)
+    assert total(own, found) == pytest.approx(1.0)
+    by_pose = {m.T_world_centre.tobytes(): m.share for m in found}
+    wrong = norm.cdf(-lead / 0.3)
+    odds = by_pose[(POSE @ TURN).tobytes()] / own.share
+    assert odds == pytest.approx(max(turned, min(wrong / norm.sf(-lead / 0.3), 0.98)))
+    # what is no way round is as much less likely than the pose as before
+    assert by_pose[(POSE @ APART).tobytes()] / own.share == pytest.approx(apart)
+
+
+def test_a_way_that_the_keyframe_has_no_mode_of_is_the_pose_turned():
+    own, (other,) = ways_round(mode(1.0), (), BANANA, np.zeros(1), 0.3)
+    assert (own.share, other.share) == (pytest.approx(0.5, abs=0.01), pytest.approx(0.5, abs=0.01))
+    np.testing.assert_allclose(other.T_world_centre, POSE @ TURN)
+    # as uncertain as the pose, and more: the two surfaces aren't just the same
+    extra = np.diag(other.covariance) - np.diag(se3.adjoint(TURN) @ COVARIANCE @ se3.adjoint(TURN).T)
+    assert (extra > 0.0).all()
+
+
+def test_a_mode_of_a_view_that_is_turned_so_stands_for_its_way():
+    near = mode(0.0, POSE @ TURN @ se3.exp(np.array([0.1, 0.0, 0.0, 0.004, 0.0, 0.0])))
+    _, (other,) = ways_round(mode(1.0), (near,), BANANA, np.zeros(1), 0.3)
+    assert other == replace(near, share=other.share)
+    assert other.share == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_way_of_which_no_view_knows_is_none():
+    own, others = mode(0.7), (mode(0.3, POSE @ APART),)
+    after, (turned, apart) = sorted_by_pose(*ways_round(own, others, BANANA, np.array([np.inf]), 0.3))
+    assert (after.share, turned.share, apart.share) == (pytest.approx(0.7), 0.0, pytest.approx(0.3))
+
+
+def sorted_by_pose(own, others):
+    return own, sorted(others, key=lambda m: np.linalg.norm(m.T_world_centre - POSE @ TURN))
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_the_lead_is_that_of_a_view_however_many_there_are(repeats):
+    """Mugs stand on either end, here; the second way is ten nats behind in each view but one, which has it alone."""
+    (upside_down,) = se3.make(MODEL.shapes[0].near_symmetries, np.zeros((1, 3)))
+    looks = [(k, np.stack([HERE, HERE @ upside_down, THERE]), [SEEN, SEEN - 10.0, EMPTY]) for k in range(repeats)]
+    looks.append((repeats, (HERE @ upside_down)[None], [SEEN]))
+    mug = thing(1, *looks)
+    np.testing.assert_allclose(leads(mug, 0, HERE, RECORDING, MODEL), [10.0])
+    np.testing.assert_allclose(leads(mug, 0, HERE @ upside_down, RECORDING, MODEL), [-10.0])
+    assert leads(mug, 1, HERE, RECORDING, MODEL) == np.inf
+
+
+# --- alike things ---
+
+
+def exchanged(a, b):
+    return exchanges({1: a, 2: b}, RECORDING, MODEL)
+
+
+def test_two_alike_things_that_both_were_moved_may_be_either():
+    """Nothing but their old places told them apart."""
+    there, elsewhere_ = (se3.make(np.eye(3), np.array([x, 0.9, 0.8])) for x in (0.0, 0.6))
+    looks = [
+        [(k, a, SEEN) for k in range(4)] + [(k, b, SEEN) for k in range(4, 8)]
+        for a, b in ((HERE, there), (THERE, elsewhere_))
+    ]
+    found = exchanged(thing(1, *looks[0]), thing(2, *looks[1]))
+    (visit,) = found.in_place_of[1]  # they have their names from the other one
+    assert found.at(1, visit) == {2: pytest.approx(0.5, abs=0.01)}
+    assert found.at(2, visit) == {1: found.at(1, visit)[2]}
+
+
+def test_who_stayed_was_handled_as_equation_3_says():
+    found = exchanged(stays(1, HERE, range(8)), stays(2, THERE, range(8)))
+    handled = 1.0 - MODEL.stay_probability(MODEL.shapes[0].source, RECORDING.time_s(4) - RECORDING.time_s(3))
+    (visit,) = found.in_place_of[1]
+    assert found.at(1, visit)[2] == pytest.approx(0.5 * handled**2, abs=0.01)
+
+
+def test_within_a_visit_nothing_is_exchanged():
+    assert exchanged(stays(1, HERE, range(4)), stays(2, THERE, range(4))).in_place_of.get(1, {}) == {}
+
+
+def test_no_order_of_things_matters():
+    a, b = stays(1, HERE, range(8)), stays(2, THERE, range(8))
+    assert exchanges({2: b, 1: a}, RECORDING, MODEL) == exchanged(a, b)
+
+
+def test_what_does_not_exist_is_exchanged_with_nothing():
+    assert exchanged(stays(1, HERE, range(8)), stays(2, THERE, range(8), EMPTY)).in_place_of == {}
+
+
+@given(st.floats(0.01, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_the_reported_pose_stays_the_heavier_one(share, first, second):
+    own, rest = mode(share), (mode(1.0 - share, POSE @ TURN),)
+    places = {5: mode(1.0, HERE), 6: mode(1.0, THERE)}
+    after, others = elsewhere(own, rest, {5: first, 6: second, 7: 0.3}, places)
+    assert total(after, others) == pytest.approx(1.0)
+    assert after.share >= max([m.share for m in others[1:]], default=0.0)
