@@ -35,6 +35,9 @@ class Sensor:
         0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
     )
     bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
+    bias_surface_m: float = option(
+        0.002, "how far off a thing's surface may be as a whole: turns it by this over its radius, metres", low=0.0
+    )
     occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
 
 

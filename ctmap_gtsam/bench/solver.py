@@ -131,8 +131,8 @@ def make_task(config: Config, poses: int, *, drifting: bool = False) -> Task:
     """
     rng = generator(config.seed, "bench.solver")
     if not drifting:
-        still = replace(config.sensor, bias_rotation_rad=NEXT_TO_NOTHING, bias_translation_m=NEXT_TO_NOTHING)
-        config = replace(config, sensor=still)
+        still = dict.fromkeys(("bias_rotation_rad", "bias_translation_m", "bias_surface_m"), NEXT_TO_NOTHING)
+        config = replace(config, sensor=replace(config.sensor, **still))
     model = Model(catalogue(tuple(s for s in household() if s.object_class.name == "mug")), config, context=False)
     noise = LocalisationNoise(CAMERA_SIGMAS[0], CAMERA_SIGMAS[3], DRIFT_S if drifting else 1e-3 * STEP_S)
     n = poses // (THINGS + 1)

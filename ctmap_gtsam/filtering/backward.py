@@ -432,14 +432,16 @@ class _Writer:
         """What is said of an object at a keyframe."""
         j = place.stage_at(k)
         stage = place.stages[j]
-        shared = np.diag(self.model.shared_variance(self.localisation, stage.away_m))
         early_s = max((stage.time_ns - self.frames[k].time_ns) * 1e-9, 0.0)
-        if early_s > 0.0:
-            shared = shared + self.model.prediction_covariance(early_s)
+        early = self.model.prediction_covariance(early_s) if early_s > 0.0 else np.zeros((6, 6))
+        shared = {
+            c: early + np.diag(self.model.shared_variance(self.model.shapes[c], self.localisation, stage.away_m))
+            for c in place.traced
+        }
         probability = place.class_probability[j]
         best = int(np.argmax(probability))
         modes = tuple(
-            (c, log_weight, T, covariance + shared, free)
+            (c, log_weight, T, covariance + shared[c], free)
             for c, traced in place.traced.items()
             if probability[c] > REPORTED or c == best
             for _, log_weight, T, covariance, free in modes_of(c, traced.at(j), self.model.shapes[c])

@@ -312,11 +312,12 @@ class Updater:
         rivals = (belief.log_clutter, belief.witness, 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
         # particles are what views of this camera agree on; that the camera itself is elsewhere they can't know
-        shared = np.diag(self.model.shared_variance(self.localisation, float(np.linalg.norm(belief.viewpoint))))
+        away_m = float(np.linalg.norm(belief.viewpoint))
         modes: list[tuple[int, float, Array, Array, Array]] = []
         for c, particles in enumerate(weighted):
             if particles is not None and (probability[c] > REPORTED or c == int(np.argmax(probability))):
                 found = modes_of(c, particles, self.model.shapes[c])
+                shared = np.diag(self.model.shared_variance(self.model.shapes[c], self.localisation, away_m))
                 modes += [(c, log_weight, T, covariance + shared, free) for _, log_weight, T, covariance, free in found]
         best = int(np.argmax(probability))
         chosen = belief.classes[best]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.model import Model
+from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage, solve
 from ctmap_gtsam.smoothing.graph import Measured
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, in_world
@@ -233,7 +234,7 @@ def judge(
         if not any(len(modes) for s in sightings.values() if (modes := s.modes[c]) is not None):
             continue
         stages[c] = tuple(_stage(sightings[k], c, len(keyframes), recording) for k in keyframes)
-        posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], recording, model))
+        posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], shape, recording, model))
         evidence[c] = posteriors[c].log_evidence
     scores = _score_evidence(boxes, recording, model)
     clutter = float(sum(s.log_clutter for s in sightings.values()))
@@ -257,12 +258,12 @@ def _witness(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping
     return total
 
 
-def _noise_variance(stages: tuple[Stage, ...], recording: Recording, model: Model) -> Array:
+def _noise_variance(stages: tuple[Stage, ...], shape: Shape, recording: Recording, model: Model) -> Array:
     """(6,) how far two views of a still object differ, for localisation's error and the depth's bias."""
     seen = [s for s in stages if len(s.log_evidence)]
     cameras = np.stack([recording.T_world_camera(s.keyframe)[:3, 3] for s in seen])
     away = float(np.median(np.linalg.norm(cameras - np.stack([s.T_world_centre[0, :3, 3] for s in seen]), axis=-1)))
-    return model.shared_variance(recording.run.localisation, away)
+    return model.shared_variance(shape, recording.run.localisation, away)
 
 
 def _stage(sighting: Sighting, c: int, n_keyframes: int, recording: Recording) -> Stage:

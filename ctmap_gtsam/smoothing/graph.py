@@ -383,10 +383,10 @@ def _add_measurements(
 ) -> None:
     for key, pose in zip(keys.tolist(), T, strict=True):
         built.initial.insert(key, gtsam.Pose3(pose))
-    S, radius_m = shape.symmetry, shape.radius_m
+    S = shape.symmetry
     for visit in dict.fromkeys(m.visit for m in measured):
         views = np.stack([m.covariance for m in measured if m.visit == visit])
-        _add_bias(built, model, row, visit, shared_flatness(views, radius_m))
+        _add_bias(built, model, row, shape, visit, shared_flatness(views, shape.radius_m))
     seen_by = [(camera_key(m.keyframe), key, bias_key(row, m.visit)) for m, key in zip(measured, keys, strict=True)]
     information = np.linalg.inv(np.stack([m.covariance for m in measured]))
     modes = Modes(se3.inverse(recorded) @ T, information, S)
@@ -444,13 +444,12 @@ def shared_flatness(covariances: Array, radius_m: float) -> Array:
     return np.asarray(flat @ flat.T)
 
 
-def _add_bias(built: SmootherGraph, model: Model, row: int, visit: int, flatness: Array) -> None:
+def _add_bias(built: SmootherGraph, model: Model, row: int, shape: Shape, visit: int, flatness: Array) -> None:
     """The error that the measurements of an object-visit share: the depth's, and what none of them shows."""
     key = bias_key(row, visit)
     if built.initial.exists(key):
         return
-    settings = model.config.sensor
-    sigmas = np.repeat([settings.bias_rotation_rad, settings.bias_translation_m], 3)
+    sigmas = model.bias_sigmas(shape)
     built.initial.insert(key, np.zeros(6))
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     if flatness.any():

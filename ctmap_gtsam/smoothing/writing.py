@@ -104,7 +104,8 @@ def _reported(thing: Thing, k: int, told: Told) -> Mode | None:
     covariance = held.covariance
     if not held.smoothed:
         stage = thing.stages[thing.reported_class][held.view]
-        covariance = covariance + _shared(stage, held.T_world_centre, told.recording, told.model)
+        shape = told.model.shapes[thing.reported_class]
+        covariance = covariance + _shared(stage, shape, held.T_world_centre, told.recording, told.model)
     return Mode(1.0, held.T_world_centre, covariance)
 
 
@@ -151,17 +152,17 @@ def _modes(thing: Thing, c: int, i: int, recording: Recording, model: Model) -> 
     """The modes of class c at the i-th view, with all that a camera gets wrong in their covariances."""
     stage = thing.stages[c][i]
     return [
-        Mode(share, T, covariance + _shared(stage, T, recording, model))
+        Mode(share, T, covariance + _shared(stage, model.shapes[c], T, recording, model))
         for share, T, covariance in zip(
             thing.shares(c, i).tolist(), stage.T_world_centre, stage.covariance, strict=True
         )
     ]
 
 
-def _shared(stage: Stage, T_world_centre: Array, recording: Recording, model: Model) -> Array:
+def _shared(stage: Stage, shape: Shape, T_world_centre: Array, recording: Recording, model: Model) -> Array:
     """(6, 6) what a single view doesn't say of its own error: localisation's, and the depth's bias."""
     away = float(np.linalg.norm(recording.T_world_camera(stage.keyframe)[:3, 3] - T_world_centre[:3, 3]))
-    return np.diag(model.shared_variance(recording.run.localisation, away))
+    return np.diag(model.shared_variance(shape, recording.run.localisation, away))
 
 
 def _write_mode(tables: Tables, row: int, k: int, shape: Shape, mode: Mode) -> None:

@@ -20,6 +20,7 @@ CONFIG = config_of(
     "context.relations.same_category.strength=0.6",
     "sensor.bias_rotation_rad=1e-6",
     "sensor.bias_translation_m=1e-7",
+    "sensor.bias_surface_m=0",
 )
 K = 6
 

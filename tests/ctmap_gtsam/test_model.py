@@ -87,12 +87,25 @@ def test_being_missed_in_view_speaks_for_a_look_alike_and_being_out_of_sight_for
 
 @given(st.floats(0.0, 0.1), st.floats(0.0, 0.1), st.floats(0.1, 5.0))
 def test_what_views_share_grows_with_distance_by_the_cameras_turn_alone(rotation, translation, away):
-    near, far = (MODEL.shared_variance(LocalisationNoise(rotation, translation), d) for d in (away, 2.0 * away))
+    mug = MODEL.shapes[0]
+    near, far = (MODEL.shared_variance(mug, LocalisationNoise(rotation, translation), d) for d in (away, 2.0 * away))
     np.testing.assert_allclose(far[:3], near[:3])
     np.testing.assert_allclose(far[3:] - near[3:], 3.0 * (away * rotation) ** 2, atol=1e-12)
-    still = MODEL.shared_variance(LocalisationNoise(0.0, 0.0), away)
-    sensor = MODEL.config.sensor
-    np.testing.assert_allclose(still, np.repeat([sensor.bias_rotation_rad, sensor.bias_translation_m], 3) ** 2)
+    still = MODEL.shared_variance(mug, LocalisationNoise(0.0, 0.0), away)
+    np.testing.assert_allclose(still, MODEL.bias_sigmas(mug) ** 2)
+
+
+def test_a_surfaces_error_turns_a_small_thing_more_than_a_large_one():
+    """By an angle that moves either's surface by as much; no thing is turned by less than any is."""
+    model = model_of("mug", "sofa")
+    sensor = model.config.sensor
+    for shape in model.shapes:
+        turned = model.bias_sigmas(shape)[:3]
+        assert (turned > sensor.bias_rotation_rad).all()
+        np.testing.assert_allclose(
+            turned**2 - sensor.bias_rotation_rad**2, (sensor.bias_surface_m / shape.radius_m) ** 2
+        )
+        np.testing.assert_array_equal(model.bias_sigmas(shape)[3:], sensor.bias_translation_m)
 
 
 @given(st.floats(-20.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
