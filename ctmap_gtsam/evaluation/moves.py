@@ -29,10 +29,19 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MOVES = ("moves_recall", "nudges_recall", "false_moves", "false_moves_share", "moves_time_coverage", "moves_log_score")
-"""How many moves between visits, and within them, were found; in how many periods without a move one was claimed, and
-what share of them that is; how many of the moves found, with known time, happened in the interval that is claimed;
--log P of what happened, moved or not, over all periods, nats"""
+MOVES = (
+    "moves_recall",
+    "moves_recall_seen",
+    "nudges_recall",
+    "false_moves",
+    "false_moves_share",
+    "moves_time_coverage",
+    "moves_log_score",
+)
+"""How many moves between visits were found, of all and of those that can be seen, since no alike thing stands in their
+old place afterwards; how many within visits; in how many periods without a move one was claimed, and what share of them
+that is; how many of the moves found, with known time, happened in the interval that is claimed; -log P of what
+happened, moved or not, over all periods, nats"""
 
 MOVED_M = 0.02
 """A distance that isn't the truth's own inaccuracy"""
@@ -48,6 +57,8 @@ class Periods:
     """(n,) between two visits, not within one"""
     probability: Array
     """(n,) P(moved), 0 where the method says nothing"""
+    exchanged: Bools
+    """(n,) whether alike things took each other's places, so that nobody can see it"""
     in_interval: Array
     """(n,) whether the time of the move lies in the interval claimed: 0 or 1; NaN where either is unknown"""
 
@@ -65,6 +76,8 @@ class Period:
     between: bool
     """two visits, not within one"""
     moved: bool
+    exchanged: bool
+    """whether it moved to where one of its class was, and that one to where it was"""
     moved_ns: tuple[int, ...]
     """when, where the truth says"""
 
@@ -80,7 +93,8 @@ def true_periods(run: Run, truth: Truth, objects: ObjectFrames, shapes: dict[int
             )
             frames = first.index, last.index
             moved = bool(when) if truth.moves else between and _displaced(thing, frames, shapes)
-            out.append(Period(n, frames, times, between, moved, when))
+            exchanged = moved and between and _exchanged(truth, n, frames, shapes)
+            out.append(Period(n, frames, times, between, moved, exchanged, when))
     return out
 
 
@@ -97,6 +111,7 @@ def periods(
     return Periods(
         moved=np.array([period.moved for period in happened], dtype=np.bool_),
         between=np.array([period.between for period in happened], dtype=np.bool_),
+        exchanged=np.array([period.exchanged for period in happened], dtype=np.bool_),
         probability=np.array([p for p, _ in said], dtype=np.float64),
         in_interval=np.array(covered, dtype=np.float64),
     )
@@ -109,6 +124,7 @@ def move_metrics(found: Periods) -> dict[str, float | None]:
     timed = claimed & found.moved & np.isfinite(found.in_interval)
     return {
         "moves_recall": mean(claimed[found.moved & found.between]),
+        "moves_recall_seen": mean(claimed[found.moved & found.between & ~found.exchanged]),
         "nudges_recall": mean(claimed[found.moved & ~found.between]),
         "false_moves": int(stayed.sum()),
         "false_moves_share": mean(stayed),
@@ -131,7 +147,29 @@ def _stretches(run: Run, visible: Bools) -> Iterator[tuple[Frame, Frame, bool]]:
 
 
 def _displaced(thing: TrueObject, frames: tuple[int, int], shapes: dict[int, Shape]) -> bool:
-    before, after = (thing.T_world_object[np.searchsorted(thing.frames, f)] for f in frames)
+    before, after = (_pose(thing, f) for f in frames)
+    return before is not None and after is not None and _apart(thing, before, after, shapes)
+
+
+def _exchanged(truth: Truth, n: int, frames: tuple[int, int], shapes: dict[int, Shape]) -> bool:
+    """Whether another of its class stands where it stood, and stood where it stands."""
+    own = truth.objects[n]
+    alike = [other for k, other in enumerate(truth.objects) if k != n and other.obj_id == own.obj_id]
+
+    def met(mine: int, theirs: int) -> bool:
+        here, there = _pose(own, mine), [_pose(other, theirs) for other in alike]
+        return here is not None and any(T is not None and not _apart(own, here, T, shapes) for T in there)
+
+    return met(*frames) and met(*frames[::-1])
+
+
+def _pose(thing: TrueObject, frame: int) -> Array | None:
+    """(4, 4) in a frame; None where it isn't there."""
+    row = int(np.searchsorted(thing.frames, frame))
+    return thing.T_world_object[row] if row < len(thing.frames) and thing.frames[row] == frame else None
+
+
+def _apart(thing: TrueObject, before: Array, after: Array, shapes: dict[int, Shape]) -> bool:
     return float(pose.mssd(shapes[thing.obj_id], after, before)) > MOVED_M
 
 

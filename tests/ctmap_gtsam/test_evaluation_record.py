@@ -368,6 +368,30 @@ def test_a_true_object_without_a_match_has_no_claims(small):
     assert judged(run, true, missed)["moves_recall"] == 0
 
 
+def test_an_exchange_of_alike_things_is_no_move_that_can_be_seen(small):
+    """All three are of one class; the first two changed places between the visits, and nobody says so."""
+    run, truth = small
+    begin = run.frames[FRAMES].index
+    first, second, third = truth.objects
+    swapped = (exchanged_from(first, second, begin), exchanged_from(second, first, begin), third)
+    event = tuple(TrueMove(o.inst_id, 1, run.frames[END].time_ns + 1, "moved", None, None) for o in swapped[:2])
+    true = replace(truth, objects=tuple(replace(o, obj_id=first.obj_id) for o in swapped), moves=event)
+    stays = synthetic.estimate_of(
+        run, replace(true, objects=tuple(replace(o, obj_id=first.obj_id) for o in truth.objects))
+    )
+    found = judged(run, true, stays)
+    assert (found["moves_recall"], found["moves_recall_seen"]) == (0, None)
+    one = replace(true, objects=(true.objects[0], replace(second, obj_id=first.obj_id), true.objects[2]))
+    assert judged(run, one, stays)["moves_recall_seen"] == 0  # who stands where another still is was no exchange
+
+
+def exchanged_from(own, other, begin):
+    """A true object that is where another one is from a frame on."""
+    after = own.frames >= begin
+    poses = np.where(after[:, None, None], other.T_world_object, own.T_world_object)
+    return replace(own, T_world_object=poses)
+
+
 # --- calibration ---
 
 
