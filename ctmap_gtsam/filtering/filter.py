@@ -114,7 +114,10 @@ class Forward:
             # what nobody sees is believed to be as it was
             unseen = not belief.visible and i in before
             with timed(stage, "reports"):
-                reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
+                if unseen:
+                    reported[i] = replace(before[i], visible=False, ledger=())
+                else:
+                    reported[i] = self.updater.report(belief, around, before.get(i))
         new = [t for t in tracks if t.track_id not in self.owner]
         reported = self._start(new, observation, reported, before, stage)
         self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
@@ -233,7 +236,7 @@ def _estimate(run: Run, state: Forward) -> Estimate:
     tables = Tables(len(objects), len(keyframes), len(model.catalogue))
     for k, reported in enumerate(state.reports):
         for i, r in reported.items():
-            r.write(tables, rows[i], k, model)
+            r.write(tables, rows, i, k, model)
     frames = [run.frames[int(f)] for f in keyframes]
     _write_moves(tables, rows, frames, state)
     return build_estimate(

@@ -230,6 +230,13 @@ class Proposer:
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
         return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
 
+    def told(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[float, float]:
+        """What depth and the detector say of one pose (4, 4), nats: for the ledger, and no hypothesis."""
+        score, scores = self.score(shape, view, T_camera_centre[None])
+        self.hypotheses_scored -= 1
+        depth = float(view.share * self.model.kappa * scores.log_ratio[0])
+        return depth, float(score[0]) - depth
+
     def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
         return float(self._witness(view, self.score(shape, view, T_camera_centre[None])[1])[0])

@@ -39,7 +39,7 @@ from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, 
 from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, remembered
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
-from ctmap_gtsam.smoothing.writing import Told, note_class, write_at
+from ctmap_gtsam.smoothing.writing import Told, note_class, note_graph, write_at
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
@@ -346,6 +346,7 @@ class _Walk:
             self.T_world_camera[due] = smoothed.T_world_camera[due - first]
             self.camera_covariance[due] = smoothed.camera_covariance[due - first]
             self._write(due, things)
+            note_graph(self.tables, self.rows, smoothed.contributions, (due,))
 
     def _history(self, thing: Thing) -> dict[int, tuple[Array, Array]]:
         """Smoothed poses of an object that may be joined of several: of those sightings that are its own."""

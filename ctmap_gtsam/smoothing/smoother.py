@@ -26,7 +26,7 @@ from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage
-from ctmap_gtsam.smoothing.graph import Measured, Smoothed, SmootherGraph, build, smooth
+from ctmap_gtsam.smoothing.graph import Contributions, Measured, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
 from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
@@ -69,7 +69,7 @@ class Rounds:
     """whether the last round changed nothing of note"""
 
 
-_KEPT = (Rounds, Map, Smoothed, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
+_KEPT = (Rounds, Map, Smoothed, Contributions, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
 """what `Rounds` is made of"""
 
 
