@@ -70,7 +70,7 @@ def backward_run(
     """
     config, told = config or Config(), progress or SILENT
     state = forward(run, config, context=context, progress=told, keep_past=True)
-    return _estimate(run, state, told)
+    return traced_back(run, state, told)
 
 
 @dataclass(frozen=True)
@@ -480,7 +480,8 @@ class _Writer:
             self.tables.move(row, (a.keyframe, b.keyframe), probability, (a.time_ns, b.time_ns))
 
 
-def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
+def traced_back(run: Run, state: Forward, progress: Progress) -> Estimate:
+    """The particle smoother from a pass of the filter that has kept its past."""
     objects = sorted(state.beliefs)
     tables = Tables(len(objects), len(state.keyframes), len(state.model.catalogue))
     writer = _Writer(run, state, tables)

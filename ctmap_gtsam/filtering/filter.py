@@ -52,7 +52,7 @@ def filter_run(
     Returns:
         The estimate p(o_t | z_1:t) at every keyframe.
     """
-    return _estimate(run, forward(run, config or Config(), context=context, progress=progress or SILENT))
+    return filtered(run, forward(run, config or Config(), context=context, progress=progress or SILENT))
 
 
 def forward(
@@ -229,7 +229,8 @@ class Forward:
         )
 
 
-def _estimate(run: Run, state: Forward) -> Estimate:
+def filtered(run: Run, state: Forward) -> Estimate:
+    """What the filter says of a run: its pass, written down."""
     model, keyframes = state.model, state.keyframes
     objects = sorted({i for reported in state.reports for i in reported})
     rows = {i: row for row, i in enumerate(objects)}
