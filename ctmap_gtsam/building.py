@@ -17,8 +17,14 @@ from sequences.types import LocalisationNoise, Run
 
 Array = NDArray[np.float64]
 
-POTENTIALS = ("depth", "detection", "class", "prediction", "persistence", "context", "support")
+GRAPH_POTENTIALS = ("localisation", "bias", "measurement", "prediction", "context", "gauge")
+"""those that are factors of the smoother's graph, relative to their greatest value: their sum is minus its energy"""
 
+POTENTIALS = (
+    *GRAPH_POTENTIALS,
+    *("depth", "detection", "class", "persistence", "surroundings", "clutter", "witness", "evidence"),
+)
+"""see docs/format.md"""
 
 _NO_SUPPORT = -(1 << 31)  # of Estimate.moves: not known
 
@@ -64,7 +70,7 @@ class Tables:
         self.moves.append((row, gap, probability, times_ns, _NO_SUPPORT, _NO_SUPPORT))
 
     def note(self, row: int, keyframe: int, potential: str, nats: float, other: int = -1) -> None:
-        """Add a line of the ledger."""
+        """Add a line of the ledger; row -1 is no object's, other -1 no neighbour's."""
         self.ledger.append((row, keyframe, POTENTIALS.index(potential), other, nats))
 
 
@@ -89,6 +95,7 @@ def build_estimate(
         "run": run.name,
         "versions": versions(),
         "potentials": list(POTENTIALS),
+        "graph_potentials": list(GRAPH_POTENTIALS),
         "recorded_T_world_camera": [frame.T_world_camera.tolist() for frame in frames],
         **extra,
     }

@@ -36,7 +36,7 @@ from sequences.truth import truth_fingerprint
 from sequences.types import Run
 
 if TYPE_CHECKING:
-    from ctmap_gtsam.methods import Method
+    from ctmap_gtsam.methods import Method, Reading
 
 SCHEMA = 1
 SUMMARY, REPORT, ESTIMATES = "summary.json", "report.html", "estimates"
@@ -109,13 +109,18 @@ def run_methods(
             f"there is no method {', '.join(unknown)}", field="--methods", remedy=f"choose of {', '.join(registry)}"
         )
     chosen = list(registry) if methods is None else [name for name in registry if name in methods]
-    session = _Session(run, config, registry, store, progress)
+    session = _Session(run, config, registry, store, progress, _with_needs(chosen, registry))
     outcomes: dict[str, Outcome] = {}
     with progress.stage("methods", total=len(chosen)) as stage:
         for name in chosen:
             outcomes[name] = session.outcome(name)
             stage.advance()
     return outcomes
+
+
+def _with_needs(names: Sequence[str], registry: Mapping[str, Method]) -> frozenset[str]:
+    """Methods and all that they build on."""
+    return frozenset(names).union(*(_with_needs(registry[name].needs, registry) for name in names))
 
 
 def report(out: Path | str) -> Path:
@@ -204,6 +209,15 @@ class _Stored:
 
 
 @dataclass(frozen=True)
+class _Pass:
+    """A pass over the run that several methods read their estimates off."""
+
+    state: Any
+    seconds: float
+    stages: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class _Session:
     """Methods that run on one run with the same settings, each once."""
 
@@ -212,7 +226,11 @@ class _Session:
     registry: Mapping[str, Method]
     store: Path | None
     progress: Progress
+    wanted: frozenset[str]
+    """all that are to run, what others build on among them"""
     _outcomes: dict[str, Outcome] = field(default_factory=dict)
+    _passes: dict[Any, _Pass] = field(default_factory=dict)
+    """by who made them; those that a method still waits for"""
 
     def outcome(self, name: str) -> Outcome:
         """What becomes of a method, after what becomes of those that it builds on."""
@@ -230,6 +248,15 @@ class _Session:
         stored = self._stored(method)
         if stored is not None and (found := stored.load()) is not None:
             return found
+        outcome = self._made(method) if method.reading is None else self._read(method, method.reading)
+        if stored is not None:
+            assert outcome.estimate is not None
+            assert outcome.seconds is not None
+            stored.save(outcome.estimate, outcome.seconds, outcome.stages)
+        return outcome
+
+    def _made(self, method: Method) -> Outcome:
+        """Of a method that runs by itself, after those that it builds on."""
         assert method.run is not None
         needed = [self.outcome(name) for name in method.needs]
         start, watch = time.perf_counter(), Stopwatch(self.progress)
@@ -237,9 +264,32 @@ class _Session:
         estimate = method.run(self.run, self.config, watch, *(one.estimate for one in needed), **kept)
         # what it takes alone
         seconds = time.perf_counter() - start + sum(one.seconds or 0.0 for one in needed)
-        if stored is not None:
-            stored.save(estimate, seconds, watch.seconds)
         return Outcome("ok", seconds, estimate, stages=watch.seconds)
+
+    def _read(self, method: Method, reading: Reading) -> Outcome:
+        """Of a method that reads its estimate off a pass, which is made once for all that do."""
+        others = [r for name in self.wanted if name != method.name and (r := self._waits(name, reading.make))]
+        if reading.make not in self._passes:
+            start, watch = time.perf_counter(), Stopwatch(self.progress)
+            keep_past = any(r.keep_past for r in (reading, *others))
+            state = reading.make(self.run, self.config, progress=watch, keep_past=keep_past)
+            self._passes[reading.make] = _Pass(state, time.perf_counter() - start, watch.seconds)
+        made = self._passes[reading.make]
+        if not others:
+            del self._passes[reading.make]  # it holds all particles
+        start, watch = time.perf_counter(), Stopwatch(self.progress)
+        estimate = reading.read(self.run, made.state, watch)
+        seconds = made.seconds + time.perf_counter() - start
+        return Outcome("ok", seconds, estimate, stages={**made.stages, **watch.seconds})
+
+    def _waits(self, name: str, make: Any) -> Reading | None:
+        """How a method that has no estimate yet will read it off the same pass; None where it won't."""
+        method = self.registry[name]
+        reading = method.reading
+        if reading is None or reading.make is not make or name in self._outcomes:
+            return None
+        stored = self._stored(method)
+        return reading if method.skip(self.run) is None and (stored is None or stored.load() is None) else None
 
     def _stored(self, method: Method) -> _Stored | None:
         """Where its estimate would lie, and all that it is made from."""

@@ -75,10 +75,14 @@ class Moves:
 
 @dataclass(frozen=True)
 class Ledger:
-    """What each potential contributed to the energy, in nats (a larger value speaks for the estimate)."""
+    """What each potential contributed, in nats (a larger value speaks for the estimate).
+
+    The lines of Estimate.meta["graph_potentials"] are the factors of the smoother's graph, relative to their greatest
+    value: their sum is minus the graph's energy.
+    """
 
     object: Ints
-    """(L,) row of Estimate.object_id"""
+    """(L,) row of Estimate.object_id; -1 where it is no object's, as a camera's localisation"""
     keyframe: Ints
     """(L,) row of Estimate.keyframe_frame"""
     potential: Ints
@@ -86,7 +90,7 @@ class Ledger:
     other: Ints
     """(L,) the neighbour's row for context, else -1"""
     nats: Array
-    """(L,) log potential at the reported pose and class"""
+    """(L,) what it says at the reported pose and class"""
 
 
 @dataclass(frozen=True)
@@ -117,8 +121,8 @@ class Estimate:
     moves: Moves
     ledger: Ledger
     meta: Mapping[str, Any] = field(default_factory=dict)
-    """JSON: schema, method, config, seed, fingerprint, versions, potentials, surfaces, diagnostics (no seconds: those
-    would make two equal runs differ)"""
+    """JSON: schema, method, config, seed, fingerprint, versions, potentials, graph_potentials, surfaces, diagnostics
+    (no seconds: those would make two equal runs differ)"""
 
     def __post_init__(self) -> None:
         n, k, c = len(self.object_id), len(self.keyframe_frame), len(self.class_ids)

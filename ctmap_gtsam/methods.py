@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ctmap_gtsam.baselines import oracle, registration
 from ctmap_gtsam.baselines.copying import copy_back
@@ -14,8 +14,8 @@ from ctmap_gtsam.baselines.detected import register_detections
 from ctmap_gtsam.baselines.fusion import static_fusion
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.backward import backward_run
-from ctmap_gtsam.filtering.filter import filter_run
+from ctmap_gtsam.filtering.backward import traced_back
+from ctmap_gtsam.filtering.filter import Forward, filtered, forward
 from ctmap_gtsam.filtering.literal import literal_filter_run
 from ctmap_gtsam.smoothing.lagged import lagged_run
 from ctmap_gtsam.smoothing.smoother import Look, smooth_run
@@ -24,6 +24,21 @@ from sequences.types import Run
 
 Runner = Callable[..., Estimate]
 """(run, config, progress, *estimates of what it needs) -> its own"""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a method's estimate is read off a pass over the run; methods with the same `make` can share one."""
+
+    make: Callable[..., Any]
+    """(run, config, progress=, keep_past=) -> the pass"""
+    keep_past: bool
+    """whether the pass has to keep its past; one that does says the same to who doesn't need it"""
+    read: Callable[[Run, Any, Progress], Estimate]
+
+    def alone(self, run: Run, config: Config, progress: Progress) -> Estimate:
+        """The estimate off a pass of its own."""
+        return self.read(run, self.make(run, config, progress=progress, keep_past=self.keep_past), progress)
 
 
 @dataclass(frozen=True)
@@ -43,6 +58,8 @@ class Method:
     """it answers from what nobody knows outside a benchmark, and is shown as such"""
     resumes: bool = False
     """`run` takes `keep`: a file in which it keeps how far it is, or None"""
+    reading: Reading | None = None
+    """where the estimate is read off a pass that others may share; `run` makes one of its own"""
 
 
 def _needs_detections(run: Run) -> str | None:
@@ -59,16 +76,12 @@ def _needs_truth(run: Run) -> str | None:
     return oracle.obstacle(run) or registration.obstacle()
 
 
-def _filter(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
-    return filter_run(run, config, context=context, progress=progress)
+def _filtered(run: Run, state: Forward, _progress: Progress) -> Estimate:
+    return filtered(run, state)
 
 
 def _literal(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
     return literal_filter_run(run, config, context=context, progress=progress)
-
-
-def _backward(run: Run, config: Config, progress: Progress, *, context: bool) -> Estimate:
-    return backward_run(run, config, context=context, progress=progress)
 
 
 def _smooth(
@@ -85,6 +98,11 @@ def _smooth(
 def _lagged(run: Run, config: Config, progress: Progress, forward: Estimate, *, lag: int | None) -> Estimate:
     return lagged_run(run, forward, config, lag=lag, progress=progress)
 
+
+_FORWARD_T, _FORWARD_CT = (partial(forward, context=context) for context in (False, True))
+_FILTER_T = Reading(_FORWARD_T, keep_past=False, read=_filtered)
+_FILTER_CT = Reading(_FORWARD_CT, keep_past=False, read=_filtered)
+_BACKWARD_CT = Reading(_FORWARD_CT, keep_past=True, read=traced_back)
 
 METHODS: dict[str, Method] = {
     m.name: m
@@ -105,11 +123,11 @@ METHODS: dict[str, Method] = {
         Method("paper-ct", "CT-Map to the letter of the paper: Algorithm 1 with its own potentials", "estimate",
                partial(_literal, context=True), _needs_detections),
         Method("filter-t", "T-Map: the particle filter without context", "estimate",
-               partial(_filter, context=False), _needs_detections),
+               _FILTER_T.alone, _needs_detections, reading=_FILTER_T),
         Method("filter-ct", "CT-Map: the particle filter, each frame seeing the past", "estimate",
-               partial(_filter, context=True), _needs_detections),
+               _FILTER_CT.alone, _needs_detections, reading=_FILTER_CT),
         Method("ffbsi-ct", "trajectories drawn back through filter-ct's particles: a smoother without a graph",
-               "estimate", partial(_backward, context=True), _needs_detections),
+               "estimate", _BACKWARD_CT.alone, _needs_detections, reading=_BACKWARD_CT),
         Method("last-copied-back", "filter-ct's last map of each visit in all of the visit's frames", "estimate",
                copy_back, _needs_detections, needs=("filter-ct",)),
         Method("lag0-ct", "the smoother with a lag of 0: its factors and trellis, each frame seeing the past",

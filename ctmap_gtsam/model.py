@@ -82,6 +82,20 @@ class Model:
         r1 = self.config.prediction.stay_limit
         return float(stay_probability(away_s, known.persistence_s, r1, 1.0 - r1)) if known.movable else 1.0
 
+    def log_transitions(self, known: ObjectClass, dt_s: float) -> tuple[float, float, float]:
+        """What may happen to a thing of a class from one view to the next, so many seconds later: logs.
+
+        Returns:
+            That it simply stays: Equation 3 over a gap, else certain but for a push in view. That it leaves for
+            elsewhere nearby, or for where nobody looks, or comes from there: each as likely. That what isn't here
+            doesn't come.
+        """
+        p = self.config.prediction
+        stay = self.stay_probability(known, dt_s) if dt_s > p.significant_period_s else 1.0
+        stay = min(stay, 1.0 - p.jump_probability)
+        leave = np.log1p(-stay) - np.log(2.0)
+        return float(np.log(stay)), float(leave), float(np.log1p(-np.exp(leave)))
+
     def bias_sigmas(self, shape: Shape) -> Array:
         """(6,) rad and metres: the error that all depth measurements of an object in a visit share.
 

@@ -61,10 +61,20 @@ def log_potential(T_a: ArrayLike, T_b: ArrayLike, sigma: ArrayLike, symmetry: Sy
     Returns:
         (...) nats, per rad^3 m^3 (a power less for every free direction).
     """
+    return mixture.gaussian_log_density(*_reduced(T_a, T_b, sigma, symmetry))
+
+
+def exponent(T_a: ArrayLike, T_b: ArrayLike, sigma: ArrayLike, symmetry: Symmetry = NONE) -> Array:
+    """-1/2 r^T Sigma^-1 r (...): `log_potential` relative to its greatest value, minus the energy of its factor."""
+    return -0.5 * squared_distance(*_reduced(T_a, T_b, sigma, symmetry))
+
+
+def _reduced(T_a: ArrayLike, T_b: ArrayLike, sigma: ArrayLike, symmetry: Symmetry) -> tuple[Array, Array]:
+    """The residual (..., 6 - f) without free directions, and its information (..., 6 - f, 6 - f)."""
     information = np.linalg.inv(np.asarray(sigma, dtype=np.float64))
     r = residual(T_a, T_b, symmetry, information)
     reduced = np.linalg.inv(symmetry.reduced_covariance(sigma))
-    return mixture.gaussian_log_density((symmetry.projection @ r[..., None])[..., 0], reduced)
+    return (symmetry.projection @ r[..., None])[..., 0], np.asarray(reduced, dtype=np.float64)
 
 
 def log_potential_jacobians(

@@ -70,7 +70,7 @@ def backward_run(
     """
     config, told = config or Config(), progress or SILENT
     state = forward(run, config, context=context, progress=told, keep_past=True)
-    return _estimate(run, state, told)
+    return traced_back(run, state, told)
 
 
 @dataclass(frozen=True)
@@ -341,6 +341,7 @@ class _Writer:
         self.model = state.model
         self.state = state
         self.tables = tables
+        self.rows = {i: row for row, i in enumerate(sorted(state.beliefs))}
         self.localisation = run.localisation
         self.frames = [run.frames[int(f)] for f in state.keyframes]
         self.tracer = Tracer(state.model, run.localisation)
@@ -356,9 +357,9 @@ class _Writer:
                 if place is places[-1] and k >= place.stages[-1].keyframe:
                     # it has seen all that there is to see
                     visible = final.visible if k == len(self.frames) - 1 else self._in_view(final, k)
-                    replace(final, visible=visible).write(self.tables, row, k, self.model)
+                    replace(final, visible=visible).write(self.tables, self.rows, object_id, k, self.model)
                 else:
-                    self._smoothed(place, final, k).write(self.tables, row, k, self.model)
+                    self._smoothed(place, final, k).write(self.tables, self.rows, object_id, k, self.model)
             self._write_moves(row, place)
             for j, stage in enumerate(place.stages):
                 traced = place.traced.get(int(np.argmax(place.class_probability[j])))
@@ -449,7 +450,7 @@ class _Writer:
         stood = self._stood(probability, self.frames[place.past.begin].time_ns - self.frames[k].time_ns)
         existence = float(np.clip(place.presence[j] * stood, 0.0, 1.0))
         smoothed = replace(
-            final, class_probability=probability, existence=existence, modes=modes, ledger={}, visible=True
+            final, class_probability=probability, existence=existence, modes=modes, ledger=(), visible=True
         )
         return replace(smoothed, visible=self._in_view(smoothed, k))
 
@@ -479,7 +480,8 @@ class _Writer:
             self.tables.move(row, (a.keyframe, b.keyframe), probability, (a.time_ns, b.time_ns))
 
 
-def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
+def traced_back(run: Run, state: Forward, progress: Progress) -> Estimate:
+    """The particle smoother from a pass of the filter that has kept its past."""
     objects = sorted(state.beliefs)
     tables = Tables(len(objects), len(state.keyframes), len(state.model.catalogue))
     writer = _Writer(run, state, tables)

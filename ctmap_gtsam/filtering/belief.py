@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,7 +29,7 @@ from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model, localisation_variance
 from ctmap_gtsam.shapes import Shape
-from factors import mixture, symmetry
+from factors import mixture, prediction, symmetry
 from factors.measurement import box_iou
 from factors.mixture import log_sum
 from sequences.seeds import generator
@@ -60,6 +61,17 @@ class ClassBelief:
 
 
 @dataclass(frozen=True)
+class Glimpse:
+    """The last keyframe that had an object's place in view, as far as its ledger goes."""
+
+    view: View
+    T_camera_world: Array
+    """(4, 4)"""
+    waited_s: float | None
+    """since the keyframe in view before; None where it is the first"""
+
+
+@dataclass(frozen=True)
 class Belief:
     """What is believed of one object after a keyframe."""
 
@@ -88,6 +100,7 @@ class Belief:
     visible: bool
     steps: int
     """keyframes in view since the start"""
+    glimpse: Glimpse
     searched: int = 1
     """steps when it was last searched for"""
     memory: Memory = field(default_factory=Memory)
@@ -124,6 +137,16 @@ class _Standard:
 
 
 @dataclass(frozen=True)
+class Line:
+    """A line of the ledger."""
+
+    potential: str
+    nats: float
+    other: int | None = None
+    """the neighbour"""
+
+
+@dataclass(frozen=True)
 class Reported:
     """What is said of an object at a keyframe."""
 
@@ -137,7 +160,8 @@ class Reported:
     visible: bool
     modes: tuple[tuple[int, float, Array, Array, Array], ...]
     """class index, log weight, T_world_centre (4, 4), covariance (6, 6), free axes (6, f)"""
-    ledger: dict[str, float]
+    ledger: tuple[Line, ...] = ()
+    """of a keyframe that had its place in view"""
     effective: float = 0.0
     """effective sample size of the most probable class"""
 
@@ -152,8 +176,17 @@ class Reported:
         own = [m for m in self.modes if m[0] == self.best_class]
         return max(own, key=lambda m: m[1])[2] if own else None
 
-    def write(self, tables: Tables, row: int, keyframe: int, model: Model) -> None:
-        """Into an estimate's tables, poses in the mesh frame."""
+    def write(self, tables: Tables, rows: Mapping[int, int], i: int, keyframe: int, model: Model) -> None:
+        """Into an estimate's tables, poses in the mesh frame.
+
+        Args:
+            tables: written to.
+            rows: object -> its row.
+            i: the object.
+            keyframe: row of it.
+            model: knows the meshes.
+        """
+        row = rows[i]
         tables.class_probability[row, keyframe] = self.class_probability
         tables.existence[row, keyframe] = self.existence
         tables.in_view[row, keyframe] = self.visible
@@ -168,8 +201,10 @@ class Reported:
                 shape.covariance_to_object(covariance),
                 shape.free_axes_to_object(free),
             )
-        for potential, nats in self.ledger.items():
-            tables.note(row, keyframe, potential, nats)
+        for line in self.ledger:
+            # a neighbour may have turned out to be an object known before
+            other = -1 if line.other is None else rows.get(line.other, -1)
+            tables.note(row, keyframe, line.potential, line.nats, other)
 
 
 class Updater:
@@ -228,6 +263,7 @@ class Updater:
             viewpoint=np.zeros(3),
             visible=True,
             steps=1,
+            glimpse=Glimpse(view, observation.frame.T_camera_world, None),
         )
         memory = Memory().joined(view, observation.frame.T_camera_world)
         fresh = replace(fresh, viewpoint=self._viewpoint(fresh, observation), memory=memory)
@@ -266,6 +302,7 @@ class Updater:
             steps=belief.steps + 1,
             searched=belief.steps if search else belief.searched,
             memory=belief.memory.joined(view, observation.frame.T_camera_world),
+            glimpse=Glimpse(view, observation.frame.T_camera_world, waited),
         )
         moved = self._rivalled(moved, view, observation)
         return self._kept(moved, belief, belief.past, observation)
@@ -291,8 +328,14 @@ class Updater:
         )
         return replace(belief, past=past.joined(stage))
 
-    def report(self, belief: Belief, around: Surroundings) -> Reported:
-        """The posterior, the context multiplied in once."""
+    def report(self, belief: Belief, around: Surroundings, before: Reported | None = None) -> Reported:
+        """The posterior, the context multiplied in once.
+
+        Args:
+            belief: of the object.
+            around: what stands there.
+            before: what was said of it at the keyframe before, for the ledger.
+        """
         log_evidence = belief.class_log_evidence(self.model)
         weighted: list[Particles | None] = []
         context = np.zeros(len(self.model.shapes))
@@ -319,16 +362,54 @@ class Updater:
                 found = modes_of(c, particles, self.model.shapes[c])
                 shared = np.diag(self.model.shared_variance(self.model.shapes[c], self.localisation, away_m))
                 modes += [(c, log_weight, T, covariance + shared, free) for _, log_weight, T, covariance, free in found]
-        best = int(np.argmax(probability))
-        chosen = belief.classes[best]
-        ledger = {
-            "depth": 0.0 if chosen is None else chosen.log_evidence,
-            "class": float(scores[best]),
-            "context": float(context[best]) if np.isfinite(context[best]) else 0.0,
-        }
+        chosen = belief.classes[int(np.argmax(probability))]
         elsewhere = float(np.exp(belief.log_elsewhere - np.logaddexp(there, belief.log_elsewhere)))
         effective = 0.0 if chosen is None else chosen.particles.effective
-        return Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), ledger, effective)
+        said = Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), effective=effective)
+        return replace(said, ledger=self._ledger(belief, said, before, around, scores, context))
+
+    def _ledger(
+        self,
+        belief: Belief,
+        said: Reported,
+        before: Reported | None,
+        around: Surroundings,
+        scores: Array,
+        context: Array,
+    ) -> tuple[Line, ...]:
+        """What each potential says of an object at the reported pose and class.
+
+        Args:
+            belief: of the object.
+            said: of it now.
+            before: of it at the keyframe before.
+            around: what stands there.
+            scores: (C,) the score vectors' evidence.
+            context: (C,) what context says of each class's particles together.
+        """
+        best, T = said.best_class, said.best_pose
+        own, shape = belief.classes[best], self.model.shapes[best]
+        lines = [
+            Line("class", float(scores[best])),
+            Line("clutter", -belief.log_clutter),
+            Line("witness", belief.witness),
+        ]
+        if own is None or T is None:
+            return tuple(lines)
+        glimpse = belief.glimpse
+        depth, detection = self.proposer.told(shape, glimpse.view, glimpse.T_camera_world @ T)
+        lines += [Line("depth", depth), Line("detection", detection), Line("evidence", own.log_evidence)]
+        lines += [Line("context", nats, j) for j, nats in around.relations(self.model, shape, T).items()]
+        lines.append(Line("surroundings", float(context[best])))
+        if glimpse.waited_s is not None:
+            lines.append(Line("persistence", self.model.log_transitions(shape.source, glimpse.waited_s)[0]))
+            if before is not None and before.best_class == best and before.best_pose is not None:
+                away = float(np.linalg.norm(belief.viewpoint))
+                spread = predicted_spread(self.model, self.localisation, glimpse.waited_s, away)
+                sigma = np.diag(np.repeat([spread.rotation_rad, spread.translation_m], 3) ** 2)
+                nats = prediction.exponent(before.best_pose, T, sigma, shape.symmetry)
+                lines.append(Line("prediction", float(nats)))
+        return tuple(lines)
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
@@ -435,8 +516,8 @@ class Updater:
         away = float(np.linalg.norm(belief.viewpoint))
         noise = self.localisation
         reach = np.array([noise.rotation_rad, noise.translation_m + away * noise.rotation_rad])
-        prediction = self.model.config.prediction
-        walked = np.array([prediction.rotation_rate, prediction.translation_rate])
+        rates = self.model.config.prediction
+        walked = np.array([rates.rotation_rate, rates.translation_rate])
         return belief.memory.log_likelihood(self.proposer, shape, T_world_centre, _LOCALISED * (reach + walked))
 
     def _step_class(

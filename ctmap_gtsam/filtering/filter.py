@@ -52,7 +52,7 @@ def filter_run(
     Returns:
         The estimate p(o_t | z_1:t) at every keyframe.
     """
-    return _estimate(run, forward(run, config or Config(), context=context, progress=progress or SILENT))
+    return filtered(run, forward(run, config or Config(), context=context, progress=progress or SILENT))
 
 
 def forward(
@@ -114,7 +114,10 @@ class Forward:
             # what nobody sees is believed to be as it was
             unseen = not belief.visible and i in before
             with timed(stage, "reports"):
-                reported[i] = replace(before[i], visible=False) if unseen else self.updater.report(belief, around)
+                if unseen:
+                    reported[i] = replace(before[i], visible=False, ledger=())
+                else:
+                    reported[i] = self.updater.report(belief, around, before.get(i))
         new = [t for t in tracks if t.track_id not in self.owner]
         reported = self._start(new, observation, reported, before, stage)
         self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
@@ -226,14 +229,15 @@ class Forward:
         )
 
 
-def _estimate(run: Run, state: Forward) -> Estimate:
+def filtered(run: Run, state: Forward) -> Estimate:
+    """What the filter says of a run: its pass, written down."""
     model, keyframes = state.model, state.keyframes
     objects = sorted({i for reported in state.reports for i in reported})
     rows = {i: row for row, i in enumerate(objects)}
     tables = Tables(len(objects), len(keyframes), len(model.catalogue))
     for k, reported in enumerate(state.reports):
         for i, r in reported.items():
-            r.write(tables, rows[i], k, model)
+            r.write(tables, rows, i, k, model)
     frames = [run.frames[int(f)] for f in keyframes]
     _write_moves(tables, rows, frames, state)
     return build_estimate(

@@ -92,10 +92,11 @@ def literal_filter_run(
             reports.append(filter_.step(observation))
             stage.advance()
     objects = sorted({i for reported in reports for i in reported})
+    rows = {i: row for row, i in enumerate(objects)}
     tables = Tables(len(objects), len(keyframes), len(run.catalogue))
     for k, reported in enumerate(reports):
         for i, said in reported.items():
-            said.write(tables, objects.index(i), k, filter_.model)
+            said.write(tables, rows, i, k, filter_.model)
     cameras = np.stack([run.frames[int(f)].T_world_camera for f in keyframes])
     sure = np.tile(localisation_covariance(run.localisation), (len(keyframes), 1, 1))
     return build_estimate(run, config, name, keyframes, objects, tables, cameras, sure, describe(filter_.place))
@@ -236,7 +237,7 @@ class _Filter:
             modes += modes_of(int(c), own, self.model.shapes[int(c)])
         best = cloud.T_world_centre[[int(np.argmax(cloud.log_weight))]]
         visible = bool(_in_view(best, frame)[0])
-        return Reported(share / share.sum(), 0.0, 1.0, 0.0, visible, tuple(modes), {})
+        return Reported(share / share.sum(), 0.0, 1.0, 0.0, visible, tuple(modes))
 
 
 def _in_view(T_world_centre: Array, frame: Frame) -> Bools:

@@ -113,7 +113,7 @@ class Associator:
     def _nearness(self, tracks: list[_Open], detections: list[Detection], points: list[Array]) -> Array:
         """(tracks, detections) from 1, in one place and called the same, to 0, further apart than its size allows."""
         believed = np.stack([t.score_sum / t.score_sum.sum() for t in tracks])
-        called = np.stack([_class_shares(d) for d in detections])
+        called = np.stack([class_shares(d) for d in detections])
         same = believed @ called.T
         apart = np.linalg.norm(np.stack([t.point_world for t in tracks])[:, None] - np.stack(points), axis=-1)
         near = np.maximum(1.0 - apart / self._reach_m[np.argmax(believed, axis=1)][:, None], 0.0)
@@ -124,7 +124,7 @@ class Associator:
         frame = observation.frame
         track.point_world, track.box, track.last_ns = point, np.array(detection.box), frame.time_ns
         track.z = float(se3.transform(frame.T_camera_world, point[None])[0, 2])
-        track.score_sum = track.score_sum + _class_shares(detection)
+        track.score_sum = track.score_sum + class_shares(detection)
         track.keyframes.append(observation.keyframe)
         track.detections.append(detection)
         if track.started is None and len(track.keyframes) >= self._settings.start_after:
@@ -150,8 +150,8 @@ class Associator:
         self._extend(track, observation, detection, point)
 
 
-def _class_shares(detection: Detection) -> Array:
-    """(C,) its scores without the background's, of sum 1."""
+def class_shares(detection: Detection) -> Array:
+    """(C,) a detection's scores without the background's, of sum 1."""
     scores = detection.class_scores[1:] + 1e-9
     return np.asarray(scores / scores.sum())
 

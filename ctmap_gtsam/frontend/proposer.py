@@ -193,7 +193,7 @@ class Proposer:
         coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
         starts = self._perturb(shape, best, rng)
-        if shape.reach_m > _SMALL_REACH_M:
+        if _large(shape):
             shifted = shifted_poses(shape, best, observation.planes)
             starts = np.concatenate([starts, self._best(shape, view, shifted, keep)])
         around = self._refine(shape, view, starts, self._coarse(shape)[self._coarse_steps // 2 :])
@@ -229,6 +229,13 @@ class Proposer:
         covariance = self._shape_of_score(shape, view, poses, probe)
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
         return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
+
+    def told(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[float, float]:
+        """What depth and the detector say of one pose (4, 4), nats: for the ledger, and no hypothesis."""
+        score, scores = self.score(shape, view, T_camera_centre[None])
+        self.hypotheses_scored -= 1
+        depth = float(view.share * self.model.kappa * scores.log_ratio[0])
+        return depth, float(score[0]) - depth
 
     def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
@@ -317,7 +324,7 @@ class Proposer:
         up = surfaces[0].normal
         resting = resting_poses(shape, rays, surfaces, observation.planes, up, uniforms[:, 6:])
         near = np.abs(resting[:, 2, 3] - z) < _REST_REACH * shape.reach_m
-        if shape.reach_m <= _SMALL_REACH_M or not len(shape.flats):
+        if not _large(shape) or not len(shape.flats):
             resting = resting[near][: n // 2]
             return np.concatenate([resting, anyhow[: n - len(resting)]])
         resting = resting[near][: n // 4]
@@ -433,6 +440,11 @@ def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float
     return kept
 
 
+def _large(shape: Shape) -> bool:
+    """Whether a class is furniture by its size: it needs more to be found."""
+    return shape.reach_m > _SMALL_REACH_M
+
+
 def _worth(shape: Shape, seen_m: float) -> float:
     """Effort for a class by its size: more for furniture, little for what could hardly look so large or so small.
 
@@ -445,7 +457,7 @@ def _worth(shape: Shape, seen_m: float) -> float:
     sides = np.sort(np.ptp(shape.mesh.vertices, axis=0))
     if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
         return _LITTLE
-    return _FURNITURE if shape.reach_m > _SMALL_REACH_M else 1.0
+    return _FURNITURE if _large(shape) else 1.0
 
 
 def _ladder(poses: Array, axes: Array) -> Array:

@@ -11,7 +11,7 @@ from ctmap_gtsam.frontend.observation import reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape, one_place_m
-from factors.context import context_log_ratio, doubted, hinge_log_potential
+from factors.context import context_log_ratio, context_residual, doubted, hinge_log_potential
 from sequences import se3
 from sequences.camera import Camera
 from sequences.geometry import Plane, plane_depth
@@ -95,6 +95,19 @@ class Surroundings:
             return np.zeros(len(T_world_centre))
         together = self._category(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre)
         return together + support_log_potential(model, shape, T_world_centre, self.supports)
+
+    def relations(self, model: Model, shape: Shape, T_world_centre: Array) -> dict[int, float]:
+        """What each related neighbour says of one pose (4, 4) by category, relative to its greatest value, nats.
+
+        As the graph's factor for the pair says it, there spread over the keyframes that the two share.
+        """
+        out = {}
+        for other in self.neighbours if model.context else ():
+            pair = model.relations[shape.index, other.shape.index]
+            if pair.together > 0.0:
+                distance = np.linalg.norm(T_world_centre[:3, 3] - other.T_world_centre[:3, 3])
+                out[other.object_id] = float(-0.5 * context_residual(distance, pair)[0] ** 2)
+        return out
 
     def _category(self, model: Model, shape: Shape, T: Array) -> Array:
         total = np.zeros(len(T))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from ctmap_gtsam.frontend.association import class_shares
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.modes import Recording
@@ -86,7 +87,7 @@ def _affinity(frame: Frame, z: Array, model: Model, expected: Expected) -> Array
         return np.zeros(len(frame.detections))
     boxes = np.array([d.box for d in frame.detections])
     overlap = box_iou(seen.box[None], boxes)
-    called = np.stack([d.class_scores[1:] / max(d.class_scores[1:].sum(), 1e-9) for d in frame.detections])
+    called = np.stack([class_shares(d) for d in frame.detections])
     same = called @ expected.class_probability
     least = 0.5 * model.config.frontend.association_iou
     part = (_inside(boxes, seen.box) >= _WITHIN) & (same >= _CALLED)

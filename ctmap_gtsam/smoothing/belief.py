@@ -25,8 +25,6 @@ LIKELY = 15.0
 SURE = 0.8
 """a class more probable than this is taken for granted by the neighbours"""
 
-_STAYED = 0.5
-
 
 @dataclass(frozen=True)
 class Held:
@@ -160,7 +158,7 @@ class Thing:
         stayed = True
         for i, (stage, state) in enumerate(zip(self.stages[c], self.posteriors[c].path, strict=True)):
             if i:
-                stayed = stayed and self.posteriors[c].moved[i - 1] < _STAYED
+                stayed = stayed and self.posteriors[c].stayed(i)
             if state >= len(stage.log_evidence):
                 stayed = stayed and state == len(stage.log_evidence)
                 continue

@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 PRESENT_AT_FIRST = 0.5
 """prior probability that an object is there from the start"""
 
+_STAYED = 0.5
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -57,6 +59,10 @@ class Posterior:
     """the most probable states, given where it is likelier there than gone; n stands for unmeasured, n + 1 for gone"""
     moved: Array
     """(stages - 1,) probability that the object was there at either of two stages and did not simply stay"""
+
+    def stayed(self, i: int) -> bool:
+        """Whether it more likely stayed from the stage before stage i to that one."""
+        return bool(self.moved[i - 1] < _STAYED)
 
 
 def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: Array) -> Posterior:
@@ -132,8 +138,10 @@ class _Known:
 class _Between:
     """What may happen from one stage to the next."""
 
-    stay: float
-    """probability that the object simply stays"""
+    log_stay: float
+    """that the object simply stays; this and the next two as `Model.log_transitions` has them"""
+    log_leave: float
+    log_remain: float
     walk: Array
     """(6, 6) of the prediction"""
     sigma: Array
@@ -141,16 +149,14 @@ class _Between:
 
     @classmethod
     def of(cls, a: Stage, b: Stage, model: Model, shape: Shape, noise_variance: Array) -> _Between:
-        settings = model.config.prediction
         dt = max(b.time_s - a.time_s, 1e-3)
-        stay = model.stay_probability(shape.source, dt) if dt > settings.significant_period_s else 1.0
         walk = model.prediction_covariance(dt)
-        return cls(min(stay, 1.0 - settings.jump_probability), walk, walk + np.diag(noise_variance))
+        return cls(*model.log_transitions(shape.source, dt), walk, walk + np.diag(noise_variance))
 
 
 def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape: Shape) -> _Step:
     n, m = len(known.covariance), len(b.log_evidence)
-    log_stay = np.full((n, m + 1), np.log(between.stay))
+    log_stay = np.full((n, m + 1), between.log_stay)
     if m:
         log_stay[:, :m] += prediction.integrated_log_potential(
             known.T_world_centre[:, None],
@@ -161,13 +167,12 @@ def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape:
             shape.symmetry,
         )
     # what did not stay is gone or elsewhere nearby, each as likely
-    leave = np.log1p(-between.stay) - np.log(2.0)
-    appear = leave + model.log_uniform(shape)
+    appear = between.log_leave + model.log_uniform(shape)
     out = np.full((n + 1, m + 2), -np.inf)
     out[:n, : m + 1] = log_stay
     out[:, :m] = np.logaddexp(out[:, :m], appear)
-    out[:n, m + 1] = leave
-    out[n, m + 1] = np.log1p(-np.exp(leave))
+    out[:n, m + 1] = between.log_leave
+    out[n, m + 1] = between.log_remain
     return _Step(out, log_stay, float(appear))
 
 

@@ -179,6 +179,24 @@ class SmootherGraph:
         compiled = [self._compiled.at(i).error(values) for i in range(self._compiled.size())]
         return np.concatenate([compiled, *self.problem().batch_errors(values)])
 
+    def contributions(self, values: Any) -> Contributions:
+        """What each factor says at given values, in the order of `labels`."""
+        labels = self.labels
+        variables = [[Variable.of(key) for key in label.keys] for label in labels]
+        begun: dict[Variable, int] = {}
+        for label, own in zip(labels, variables, strict=True):
+            if label.kind == "measurement":
+                begun[own[-1]] = min(own[0].index, begun.get(own[-1], own[0].index))
+        keyframes = [max(begun.get(v, 0) if v.kind == "b" else v.index for v in own) for own in variables]
+        objects = [[*dict.fromkeys(v.row for v in own if v.row is not None), -1, -1] for own in variables]
+        return Contributions(
+            kind=tuple(label.kind for label in labels),
+            object=np.array([those[0] for those in objects], dtype=np.int64),
+            keyframe=np.array(keyframes, dtype=np.int64),
+            other=np.array([those[1] for those in objects], dtype=np.int64),
+            nats=-self.errors(values),
+        )
+
     def energy(self, values: Any) -> dict[str, float]:
         """Error by kind at given values, nats."""
         out: dict[str, float] = {}
@@ -203,6 +221,22 @@ class Carried:
 
 
 @dataclass(frozen=True)
+class Contributions:
+    """What each of n factors says at the solution: the graph's part of an estimate's ledger."""
+
+    kind: tuple[str, ...]
+    """(n,) as `Label` has it"""
+    object: NDArray[np.int64]
+    """(n,) -1 for cameras alone; the lower of a pair"""
+    keyframe: NDArray[np.int64]
+    """(n,) the later of two; of an object-visit's error that of its first measurement"""
+    other: NDArray[np.int64]
+    """(n,) the other object of a pair, else -1"""
+    nats: Array
+    """(n,) log potential relative to its greatest value: minus the factor's error"""
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """The solution in arrays."""
 
@@ -213,6 +247,8 @@ class Smoothed:
     """(K, 6, 6)"""
     objects: Mapping[int, Mapping[int, tuple[Array, Array]]]
     """object -> keyframe -> T_world_centre (4, 4) and covariance (6, 6)"""
+    contributions: Contributions
+    """of each factor of the graph; their sum is minus its energy"""
 
 
 def _between_edges(compiled: Any, labels: Sequence[Label]) -> list[Edges]:
@@ -316,7 +352,8 @@ def smooth(
     poses = {
         row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured} for row, (_, measured) in objects.items()
     }
-    return Smoothed(solution, np.stack([c[0] for c in cameras]), np.stack([c[1] for c in cameras]), poses)
+    T, covariance = (np.stack([camera[i] for camera in cameras]) for i in range(2))
+    return Smoothed(solution, T, covariance, poses, built.contributions(solution.values))
 
 
 def _add_cameras(built: SmootherGraph, cameras: Sequence[Camera], noise: LocalisationNoise, first: int) -> None:

@@ -39,7 +39,7 @@ from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, 
 from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, remembered
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
-from ctmap_gtsam.smoothing.writing import Told, note_class, write_at
+from ctmap_gtsam.smoothing.writing import Told, note_class, note_graph, write_at
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
@@ -180,7 +180,8 @@ class _Walk:
         for i in sorted(new):
             self.objects[i].poses = remembered(self.model, {}, now[i].poses)
             self._see_recent(i, now[i], {})
-        changed = {i for i in now if i not in new and self._see(i, observation, now[i], before)}
+        around = Surroundings(neighbours_of(before, k, self.model), self.recording.place.surfaces)
+        changed = {i for i in now if i not in new and self._see(i, observation, now[i], around.without(i))}
         self._judge(changed | new)
         self._merge()
         if len(self.things) > 1:
@@ -236,13 +237,12 @@ class _Walk:
         apart = np.linalg.norm(b.poses[c][0, :3, 3] - pose[0, :3, 3])
         return bool(apart > self.model.shapes[c].reach_m)
 
-    def _see(self, i: int, observation: Observation, b: Believed, before: Mapping[int, Thing]) -> bool:
+    def _see(self, i: int, observation: Observation, b: Believed, around: Surroundings) -> bool:
         """Look at an object, among what was there a keyframe ago; whether it is in view."""
         o, k = self.objects[i], observation.keyframe
         wish = self._wish(i, k, b)
         fresh = news(self.model, o.poses, b.poses)
         o.poses = remembered(self.model, o.poses, fresh)
-        around = Surroundings(neighbours_of(before, k, self.model), self.recording.place.surfaces).without(i)
         last = o.looks[max(o.looks)] if o.looks else None
         at = look(observation, self.recording.time_s(k), self.proposer, wish, o.boxes.get(k), around, last)
         if fresh:
@@ -346,6 +346,7 @@ class _Walk:
             self.T_world_camera[due] = smoothed.T_world_camera[due - first]
             self.camera_covariance[due] = smoothed.camera_covariance[due - first]
             self._write(due, things)
+            note_graph(self.tables, self.rows, smoothed.contributions, (due,))
 
     def _history(self, thing: Thing) -> dict[int, tuple[Array, Array]]:
         """Smoothed poses of an object that may be joined of several: of those sightings that are its own."""

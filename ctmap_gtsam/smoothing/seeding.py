@@ -43,11 +43,8 @@ class Seed:
     """(C,) when it was last there"""
     there: NDArray[np.bool_]
     """(K,) the keyframes at which it was believed to be there"""
-
-    @property
-    def surest(self) -> int:
-        """The last keyframe at which it was there."""
-        return int(np.flatnonzero(self.there)[-1]) if self.there.any() else len(self.there) - 1
+    surest: int
+    """the last of these; of what never was there the likeliest"""
 
     @property
     def best_class(self) -> int:
@@ -161,7 +158,8 @@ def _begun_as(seed: Seed, other: Seed, model: Model) -> Seed:
         believed[c] = believed.get(c, {}) | {k: T for k, T in then.items() if k in apart}
     believed = {c: then for c, then in believed.items() if then}
     poses = {c: T for c, T in remembered(model, seed.poses, other.poses).items() if c in believed}
-    return replace(seed, poses=poses, believed=believed, there=seed.there | other.there)
+    surest = max(seed.surest, other.surest)
+    return replace(seed, poses=poses, believed=believed, there=seed.there | other.there, surest=surest)
 
 
 def _seed(object_id: int, row: int, forward: Estimate, model: Model, first: int, end: int) -> Seed:
@@ -182,7 +180,7 @@ def _seed(object_id: int, row: int, forward: Estimate, model: Model, first: int,
     keyframes = np.arange(len(forward.keyframe_frame))
     there = (forward.existence[row] > EXISTS) & (first <= keyframes) & (keyframes < end)
     surest = first + _surest(forward.existence[row, first:end])
-    return Seed(object_id, poses, believed, forward.class_probability[row, surest], there)
+    return Seed(object_id, poses, believed, forward.class_probability[row, surest], there, surest)
 
 
 def _surest(existence: Array) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
-from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
+from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.runtime.checkpoint import Checkpoint
 from ctmap_gtsam.runtime.settings import to_dict
@@ -26,7 +26,7 @@ from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage
-from ctmap_gtsam.smoothing.graph import Measured, Smoothed, SmootherGraph, build, smooth
+from ctmap_gtsam.smoothing.graph import Contributions, Measured, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
 from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
@@ -69,7 +69,7 @@ class Rounds:
     """whether the last round changed nothing of note"""
 
 
-_KEPT = (Rounds, Map, Smoothed, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
+_KEPT = (Rounds, Map, Smoothed, Contributions, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
 """what `Rounds` is made of"""
 
 
@@ -169,12 +169,12 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
 
     boxes = associate(recording, model, seeds, expected)
 
-    def neighbours(i: int, k: int) -> tuple[Neighbour, ...]:
+    def around(k: int) -> Surroundings:
         # of two things in one place, the one with more boxes has it
         there = (seed.neighbour(k, float(len(boxes[j])), model) for j, seed in seeds.items())
-        return Surroundings(tuple(n for n in there if n is not None), ()).without(i).neighbours
+        return Surroundings(tuple(n for n in there if n is not None), recording.place.surfaces)
 
-    sightings = gather(recording, proposer, wanted, boxes, neighbours, progress, "round 1")
+    sightings = gather(recording, proposer, wanted, boxes, around, progress, "round 1")
     return _solve(recording, model, boxes, sightings)
 
 
@@ -189,11 +189,11 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
         thing = current.things[i]
         return wanted_of(thing, k, recording, model, thing.sightings.get(k))
 
-    def neighbours(i: int, k: int) -> tuple[Neighbour, ...]:
-        return Surroundings(neighbours_of(current.things, k, model), ()).without(i).neighbours
+    def around(k: int) -> Surroundings:
+        return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces)
 
     boxes = associate(recording, model, current.things, expected)
-    sightings = gather(recording, proposer, wanted, boxes, neighbours, progress, name)
+    sightings = gather(recording, proposer, wanted, boxes, around, progress, name)
     return _solve(recording, model, boxes, sightings)
 
 

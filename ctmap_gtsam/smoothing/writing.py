@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.building import Tables, build_estimate
+from ctmap_gtsam.building import GRAPH_POTENTIALS, Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.place import describe
 from ctmap_gtsam.frontend.proposer import FLAT_M
@@ -18,7 +18,7 @@ from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.alternatives import Exchanges, Mode, elsewhere, exchanges, leads, ways_round
 from ctmap_gtsam.smoothing.belief import Thing
 from ctmap_gtsam.smoothing.discrete import Stage
-from ctmap_gtsam.smoothing.graph import Smoothed
+from ctmap_gtsam.smoothing.graph import Contributions, Smoothed
 from ctmap_gtsam.smoothing.modes import Recording
 
 Array = NDArray[np.float64]
@@ -39,6 +39,8 @@ def write(
         for k in range(len(recording.keyframes)):
             write_at(tables, row, k, thing, told, smoothed.T_world_camera[k])
         note_class(tables, row, thing)
+    rows = {thing.object_id: row for row, thing in enumerate(kept)}
+    note_graph(tables, rows, smoothed.contributions, range(len(recording.keyframes)))
     return build_estimate(
         recording.run,
         model.config,
@@ -78,7 +80,7 @@ def write_at(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world
     _write_pose(tables, row, k, thing, told, T_world_camera)
     if k in thing.sightings:
         _write_move(tables, row, k, thing, told.recording, told.model.config.prediction.significant_period_s)
-        _write_ledger(tables, row, k, thing)
+        _write_ledger(tables, row, k, thing, told.model)
 
 
 def _write_pose(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
@@ -195,16 +197,45 @@ def free_axes(shape: Shape, covariance: Array) -> Array:
     return np.asarray(np.linalg.qr(np.concatenate([own, wide[:, : _MOST_FREE - own.shape[1]]], axis=1))[0])
 
 
-def _write_ledger(tables: Tables, row: int, k: int, thing: Thing) -> None:
-    """What each potential says at the mode that the best path goes through."""
+def _write_ledger(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
+    """What the trellis weighs at the states that the best path goes through."""
     c, i = thing.reported_class, thing.keyframes.index(k)
+    tables.note(row, k, "clutter", -thing.sightings[k].log_clutter)
+    if i:
+        tables.note(row, k, "persistence", _log_persistence(thing, c, i, model))
     modes, stage, state = thing.sightings[k].modes[c], thing.stages[c][i], thing.posteriors[c].path[i]
     if modes is None or state >= len(stage.log_evidence):
         return
     depth = float(modes.depth_log_ratio[state])
     tables.note(row, k, "depth", depth)
     tables.note(row, k, "detection", float(modes.log_likelihood[state]) - depth)
-    tables.note(row, k, "context", float(stage.log_evidence[state] - modes.log_likelihood[state]))
+    tables.note(row, k, "surroundings", float(stage.log_evidence[state] - modes.log_likelihood[state]))
+    tables.note(row, k, "witness", float(modes.witness[state]))
+
+
+def _log_persistence(thing: Thing, c: int, i: int, model: Model) -> float:
+    """That an object of class c stayed from the view before its i-th, or left or came, or wasn't there at either."""
+    (a, b), path = thing.stages[c][i - 1 : i + 1], thing.posteriors[c].path
+    stay, leave, remain = model.log_transitions(model.shapes[c].source, b.time_s - a.time_s)
+    gone = [path[i - 1] > len(a.log_evidence), path[i] > len(b.log_evidence)]
+    if all(gone):
+        return remain
+    return leave if any(gone) or not thing.posteriors[c].stayed(i) else stay
+
+
+def note_graph(tables: Tables, rows: Mapping[int, int], graph: Contributions, keyframes: Container[int]) -> None:
+    """What the graph's factors say, in the ledger: those of some keyframes.
+
+    Args:
+        tables: written to.
+        rows: object -> its row.
+        graph: of the solution; what a window carries on from before it is no factor of a keyframe.
+        keyframes: of which factors are written.
+    """
+    columns = (graph.kind, graph.object.tolist(), graph.keyframe.tolist(), graph.other.tolist(), graph.nats.tolist())
+    for kind, i, k, j, nats in zip(*columns, strict=True):
+        if kind in GRAPH_POTENTIALS and k in keyframes:
+            tables.note(rows.get(i, -1), k, kind, nats, rows.get(j, -1))
 
 
 def note_class(tables: Tables, row: int, thing: Thing) -> None:

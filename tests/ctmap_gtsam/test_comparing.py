@@ -15,6 +15,7 @@ import pytest
 from ctmap_gtsam.comparing import compare_run, report, run_methods
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.methods import Reading
 from ctmap_gtsam.runtime.sources import code
 from sequences.bop import load_run, load_truth
 from sequences.errors import InputError
@@ -34,6 +35,7 @@ class Fake:
     needs: tuple[str, ...] = ()
     reads_truth: bool = False
     resumes: bool = False
+    reading: Any = None
 
     def skip(self, run):
         return self.reason
@@ -130,6 +132,42 @@ def test_what_a_method_builds_on_runs_before_it_and_once(path, tmp_path, registr
     assert ran[3:] == ["smooth-ct", "filter-ct", "builds"]
     inside["builds"].estimate.save(tmp_path / "inside.npz")
     assert (tmp_path / "inside.npz").read_bytes() == (tmp_path / "builds.npz").read_bytes()
+
+
+def read_methods(path, made):
+    """Two fakes that read off one pass, of which only one needs what it has kept."""
+
+    def make(run, config, *, progress, keep_past):
+        made.append(keep_past)
+        with progress.stage("pass"):
+            return keep_past
+
+    def reading(name, keep_past):
+        def read(run, state, progress):
+            assert state or not keep_past
+            return Fake(name).run(run, Config(), progress)
+
+        return Reading(make, keep_past, read)
+
+    return {name: Fake(name, reading=reading(name, past)) for name, past in (("on", False), ("back", True))}
+
+
+@pytest.mark.parametrize(("methods", "kept"), [(["on"], False), (["back"], True), (None, True)])
+def test_what_methods_read_their_estimates_off_is_made_once_and_keeps_what_one_of_them_needs(path, methods, kept):
+    made = []
+    outcomes = run_methods(load_run(path), methods, Config(), registry=read_methods(path, made))
+    assert made == [kept]
+    for outcome in outcomes.values():
+        assert list(outcome.stages) == ["pass", "work: half of it", "work"]
+        assert outcome.seconds > 0.0
+
+
+def test_a_pass_keeps_nothing_for_an_estimate_that_is_there_already(path, tmp_path):
+    made = []
+    registry = read_methods(path, made)
+    for methods in (["back"], None, None):
+        run_methods(load_run(path), methods, Config(), tmp_path, registry=registry)
+    assert made == [True, False]
 
 
 def test_a_method_that_works_in_rounds_keeps_them_beside_the_estimates(path, tmp_path, ran):

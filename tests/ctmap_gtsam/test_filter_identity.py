@@ -29,7 +29,7 @@ def report(x, existence=1.0, classes=(0.9, 0.1)):
     T = se3.make(np.eye(3), np.array([x, 0.0, 0.0]))
     best = int(np.argmax(classes))
     modes = ((best, 0.0, T, np.eye(6), np.zeros((6, 0))),)
-    return Reported(np.array(classes), 10.0, existence, 0.0, True, modes, {})
+    return Reported(np.array(classes), 10.0, existence, 0.0, True, modes)
 
 
 def test_a_track_in_an_objects_place_is_that_object_whatever_its_class():
@@ -94,7 +94,7 @@ def believed(object_id, evidence):
     classes = tuple(ClassBelief(particles, float(nats)) for nats in evidence)
     nothing = np.zeros(len(classes))
     return Belief(
-        object_id, classes, nothing, nothing, 0.0, 0.0, -np.inf, 0, 10 * object_id, 0, 0, np.ones(3), True, 1
+        object_id, classes, nothing, nothing, 0.0, 0.0, -np.inf, 0, 10 * object_id, 0, 0, np.ones(3), True, 1, None
     )  # fmt: skip
 
 
