@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.frontend.observation import Observation, centre_depth, observations
 from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
-from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
+from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from sequences import se3
@@ -125,7 +125,7 @@ def gather(
     proposer: Proposer,
     wanted: Callable[[int, int], Wanted | None],
     boxes: Mapping[int, Boxes],
-    neighbours: Callable[[int, int], tuple[Neighbour, ...]],
+    around: Callable[[int, int], Surroundings],
     progress: Progress,
     name: str,
 ) -> dict[int, dict[int, Sighting]]:
@@ -136,7 +136,7 @@ def gather(
         proposer: who refines.
         wanted: (object, keyframe) -> what to start from; None where the object isn't looked for.
         boxes: object -> its detections.
-        neighbours: (object, keyframe) -> objects whose pixels are theirs.
+        around: (object, keyframe) -> what stands around it: the neighbours' pixels are theirs.
         progress: who is told.
         name: of this round, for the progress.
 
@@ -152,8 +152,8 @@ def gather(
             for i, wish in asked.items():
                 assert observation is not None
                 detection = boxes[i].get(k)
-                around = Surroundings(neighbours(i, k), recording.place.surfaces)
-                found = look(observation, recording.time_s(k), proposer, wish, detection, around, last.get(i))
+                time_s = recording.time_s(k)
+                found = look(observation, time_s, proposer, wish, detection, around(i, k), last.get(i))
                 if found is not None:
                     seen[i][k] = sight(found, proposer, wish)
                     last[i] = found
