@@ -37,8 +37,6 @@ from factors.symmetry import Symmetry
 
 Array = NDArray[np.float64]
 
-_MOVED = 2.0  # of the spread of how pairs stand: who moved less isn't told from who stayed
-
 
 @dataclass(frozen=True)
 class Stand:
@@ -132,8 +130,8 @@ def _moved_since(i: int, now: Stand, others: Sequence[Stands], model: Model) -> 
 
 
 def _apart(a: Stand, b: Stand, model: Model) -> bool:
-    least = _MOVED * model.config.context.instance.translation_m
-    return bool(np.linalg.norm(a.T_world_centre[:3, 3] - b.T_world_centre[:3, 3]) > least)
+    apart = np.linalg.norm(a.T_world_centre[:3, 3] - b.T_world_centre[:3, 3])
+    return bool(apart > model.config.context.moved_m)
 
 
 def _placements(i: int, j: int, visits: Sequence[int], others: Sequence[Stands], model: Model) -> list[int]:

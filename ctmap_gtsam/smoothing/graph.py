@@ -477,14 +477,12 @@ def _add_context(
         classes = objects[a][0].index, objects[b][0].index
         visits = {m.keyframe: m.visit for m in objects[a][1]}
         shared = [k for k in sorted({m.keyframe for m in objects[b][1]} & visits.keys()) if k >= first]
-        # where they were moved to they stand anew: that is another fact
+        n = len(shared)
         partners = {k: p for k in shared if (p := _partner(company.get(visits[k], {}), a, b, classes)) is not None}
-        for one in {p.relation.T_a_b.tobytes(): p for p in partners.values()}.values():
-            there = [k for k, p in partners.items() if (p.relation.T_a_b == one.relation.T_a_b).all()]
-            _add_partners(built, model, (a, b), one, there)
-        shared = [k for k in shared if k not in partners]
+        for one in {id(p): p for p in partners.values()}.values():
+            _add_partners(built, model, (a, b), one, [k for k, p in partners.items() if p is one], n)
         if model.relations[classes].together > 0.0:
-            pairs += [(a, b, k, len(shared)) for k in shared]
+            pairs += [(a, b, k, n) for k in shared if k not in partners]
     if not pairs:
         return
     n = len(pairs)
@@ -502,12 +500,14 @@ def _partner(company: Company, a: int, b: int, classes: tuple[int, int]) -> Part
     return partner if partner is not None and (partner.object_id, partner.classes) == (b, classes) else None
 
 
-def _add_partners(built: SmootherGraph, model: Model, pair: tuple[int, int], partner: Partner, at: list[int]) -> None:
-    """Context of a pair in a visit in which it was moved together, at its keyframes."""
+def _add_partners(
+    built: SmootherGraph, model: Model, pair: tuple[int, int], partner: Partner, at: list[int], shared: int
+) -> None:
+    """Context of a pair in a visit in which it was moved together, at its keyframes, of all that it shares."""
     (a, c_a), (b, c_b) = list(zip(pair, partner.classes, strict=True))[:: 1 if partner.first else -1]
     n = len(at)
     related = model.relations[np.full(n, c_a), np.full(n, c_b)]
     symmetries = model.shapes[c_a].symmetry, model.shapes[c_b].symmetry
-    terms = Partners(related, partner.relation, symmetries, np.full(n, float(partner.candidates)), np.full(n, float(n)))
+    terms = Partners(related, partner.relation, symmetries, np.full(n, float(partner.candidates)), np.full(n, shared))
     names = tuple(f"objects {pair[0]} and {pair[1]} keyframe {k}" for k in at)
     built.add_batch(Batch("context", names, np.array([(object_key(a, k), object_key(b, k)) for k in at]), terms))

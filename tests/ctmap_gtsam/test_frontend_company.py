@@ -7,11 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctmap_gtsam.filtering.belief import Reported
+from ctmap_gtsam.filtering.filter import Forward
 from ctmap_gtsam.frontend.company import Stand, company
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
+from ctmap_gtsam.smoothing.graph import Camera, Measured, build
 from ctmap_gtsam.smoothing.rounds import company_of
+from factors.context import context_log_ratio
 from sequences import se3
-from tests.ctmap_gtsam.scenes import UP, config_of, model_of, shape_named, standing
+from sequences.types import LocalisationNoise
+from tests.ctmap_gtsam.scenes import UP, config_of, frame_of, looking, model_of, run_of, shape_named, standing
 
 NAMES = ("mug", "cereal_box", "soup_can", "shelf")
 MODEL = model_of(*NAMES, config=config_of("context.relations.same_category.strength=0.0"))
@@ -108,8 +113,8 @@ def test_it_is_silent_without_context_without_its_weight_and_without_up():
     assert company(now, [BEFORE], UP, MODEL)
     assert company(now, [BEFORE], None, MODEL) == {}
     assert company(now, [BEFORE], UP, model_of(*NAMES, context=False)) == {}
-    off = model_of(*NAMES, config=config_of("context.relations.category_weight=1.0"))
-    assert company(now, [BEFORE], UP, off) == {}
+    for off in ("context.relations.category_weight=1.0", "context.moved_m=1000.0"):
+        assert company(now, [BEFORE], UP, model_of(*NAMES, config=config_of(off))) == {}
 
 
 def test_another_class_than_the_one_that_was_there_says_nothing():
@@ -192,3 +197,74 @@ def test_a_visit_learns_nothing_from_itself():
             np.testing.assert_array_equal(*same)
         elsewhere = next(v for v in range(3) if v != visit)
         assert (other[elsewhere][M].relation.T_a_b != plain[elsewhere][M].relation.T_a_b).any()
+
+
+def reported(stands, sure=1.0):
+    """What a filter says of stands."""
+    out = {}
+    for i, stand in stands.items():
+        probability = np.full(len(NAMES), (1.0 - sure) / (len(NAMES) - 1))
+        probability[stand.class_index] = sure
+        modes = ((stand.class_index, 0.0, stand.T_world_centre, np.eye(6), np.zeros((6, 0))),)
+        out[i] = Reported(probability, 10.0, sure, 0.0, True, modes, {})
+    return out
+
+
+class Walked(Forward):
+    """A filter of which the visits and what it said are given."""
+
+    def __init__(self, *visits):
+        image = np.zeros((4, 4), np.float32)
+        super().__init__(run_of(MODEL.catalogue, [frame_of(0, looking(), image)]), MODEL, np.zeros(1, np.int64))
+        self.up_before = UP
+        for self.visit, said_then in enumerate(visits):
+            self._remember(said_then)
+
+    def partners(self, stands):
+        return {i: p.object_id for i, p in self.surroundings(reported(stands)).company.items()}
+
+
+def test_the_filter_learns_from_the_visits_before_alone():
+    now = carried(BEFORE, M, B)
+    state = Walked(reported(BEFORE), reported(now))
+    assert state.partners(now) == {M: B, B: M}
+    relation = state.surroundings(reported(now)).company[M].relation
+    # whatever it says of this visit, and had it said nothing of it
+    state._remember(reported(carried(BEFORE, M, C, by=(0.9, 0.9, 0.0))))
+    assert state.surroundings(reported(now)).company[M].relation is relation
+    assert Walked(reported(BEFORE), {}).partners(now) == {M: B, B: M}
+    assert Walked(reported(now)).partners(now) == {}
+
+
+def test_the_filter_remembers_what_surely_was_there():
+    now = carried(BEFORE, M, B)
+    assert Walked(reported(BEFORE, sure=0.6), {}).partners(now) == {}
+    # what was found not to be there after all is struck out, and what is out of view is no sight of it
+    assert Walked({**reported(BEFORE), M: replace(reported(BEFORE)[M], visible=False)}, {}).partners(now) == {}
+    state = Walked(reported(BEFORE))
+    state._remember(reported({M: BEFORE[M]}, sure=0.1))
+    assert set(state.stood[0]) == {B, C, S}
+
+
+def test_the_graph_has_the_context_that_the_filter_weighs_with():
+    """Energy and potential are one function, spread over the keyframes, and of nobody else than those who moved."""
+    now = carried(BEFORE, M, B)
+    cameras = [Camera(np.eye(4), 100.0 * v + k, v) for v in range(2) for k in range(3)]
+    objects = {}
+    for i in (M, B, C):
+        stands = [(BEFORE, now)[c.visit][i].T_world_centre for c in cameras]
+        shape = MODEL.shapes[now[i].class_index]
+        modes = [
+            Measured(k, c.time_s, c.visit, T, 1e-8 * np.eye(6), k % 3 > 0)
+            for k, (c, T) in enumerate(zip(cameras, stands, strict=True))
+        ]
+        objects[i] = (shape, modes)
+    partners = {1: company(now, [BEFORE], UP, MODEL)}
+    built = build(MODEL, cameras, LocalisationNoise(), objects, company=partners)
+    assert built.count()["context"] == 3
+    assert "context" not in build(MODEL, cameras, LocalisationNoise(), objects).count()
+    said_there, pair = built.energy(built.initial)["context"], MODEL.relations[MUG.index, BOX.index]
+    relation = partners[1][M]
+    peak = context_log_ratio(1.0, pair, relation.relation.log_peak)
+    # three of six keyframes
+    assert said_there == pytest.approx(0.5 * (peak - said(M, now, [BEFORE])), abs=1e-9)
