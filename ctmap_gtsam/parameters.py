@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from factors.context import CategoryRelations
+from factors.instance import InstancePrior
 from sequences.options import option
 
 
@@ -89,6 +90,10 @@ class Context:
     """Relations between objects."""
 
     relations: CategoryRelations = field(default_factory=CategoryRelations)
+    instance: InstancePrior = field(default_factory=InstancePrior)
+    moved_m: float = option(
+        0.1, "what stands so near to where it stood in another visit isn't taken to have been moved, metres", low=0.0
+    )
     support_tolerance_m: float = option(0.008, "gaps and dents up to this are errors of the surface, metres", low=0.0)
     support_sigma_m: float = option(0.01, "how far beyond that a thing may seem to float, metres", low=1e-4)
     other_support: float = option(0.3, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)

@@ -41,6 +41,8 @@ from sequences.options import option
 
 Array = NDArray[np.float64]
 
+_NEAR_PEAK = 1e-9  # nearer to the peak of a Student t its residual is linear
+
 
 @dataclass(frozen=True)
 class Relation:
@@ -195,6 +197,43 @@ def context_residual(distance_m: ArrayLike, pair: PairMixture, instance: ArrayLi
     flat = np.abs(x) < 1e-6
     slope = high * bell * x / (now * np.where(flat | (e == 0), 1.0, e))
     return e, np.where(flat, np.sqrt(high / (base + high)), slope) / pair.sigma_m, np.log(base + high)
+
+
+def falling_residual(
+    distance_m: ArrayLike, pair: PairMixture, square: ArrayLike, freedom: float, weight: float, log_gain: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """What an instance level that falls off like a Student t's takes from the context at its peak, as a residual.
+
+    With phi_ins / phi_background = left + gain (1 + q / k)^-m, context_log_ratio(d, q) = context_log_ratio(d, 0) - F,
+    and F = 1/2 |f x|^2 for the t's whitened residual x, q = |x|^2: of one minimum, smooth there, and of as many rows as
+    x, so that its curvature is known along all of them.
+
+    Args:
+        distance_m: (...) d, metres.
+        pair: of the classes, with what is left of the instance level in its `strangers`, (...).
+        square: (...) q.
+        freedom: k.
+        weight: m.
+        log_gain: (...) of the gain, w2 included.
+
+    Returns:
+        f (...), and its derivatives by q and by d (...).
+    """
+    q = np.asarray(square, dtype=np.float64)
+    x = (np.asarray(distance_m, dtype=np.float64) - pair.usual_m) / pair.sigma_m
+    bell = pair.together * np.exp(-0.5 * x * x)
+    rest, gain = pair.strangers + bell, np.exp(np.asarray(log_gain, dtype=np.float64))
+    share = gain / (rest + gain)
+    lost = -np.expm1(-weight * np.log1p(q / freedom))
+    F = -np.log1p(-share * lost)
+    slope_q = share * (1.0 - lost) * weight / (freedom + q) / (1.0 - share * lost)
+    slope_d = share * lost / (1.0 - share * lost) / (rest + gain) * bell * x / pair.sigma_m
+    small = q < _NEAR_PEAK
+    safe = np.where(small, 1.0, q)
+    f = np.sqrt(2.0 * np.where(small, slope_q, F / safe))
+    by_q = np.where(small, 0.0, (slope_q / safe - F / safe**2) / f)
+    by_d = np.where(small, 0.0, slope_d / safe / f)
+    return f, by_q, by_d
 
 
 def hinge_residual(excess_m: ArrayLike, sigma_m: ArrayLike) -> tuple[Array, Array]:

@@ -13,9 +13,18 @@ takes them out. On the left, discrete ones are tried, and the one that makes the
 continuous axis a is turned until b's centre lies in one half-plane of a, which takes out one dimension. What has no
 orientation at all (a ball) must be b, where it loses three.
 
-The background, to which it is a ratio, has b anywhere in a volume around a, in any orientation. Two things that stand
-upright on one surface gain several nats against it by gravity alone, and n things that nobody touched gain as often as
-they have pairs: whoever adds ratios of several neighbours must see to it that one fact counts once.
+The background, to which it is a ratio, is a thing that was moved and put down somewhere else. Gravity says how high it
+is then and how it is tilted: only where in the plane it stands and with what yaw is news, three unknowns of six,
+uniform over an area and a full turn. Against b anywhere in a volume, anyhow turned, two things that stand upright on
+one surface would gain several nats by gravity alone.
+
+What stayed is no news either (Equation 3), and what was moved was moved together with one partner at most. So a thing
+with n neighbours that were moved as well has for its place the mixture
+
+    (1 - 1/n) phi_background + 1/n phi_ins                                                        `among_log_ratio`
+
+of its partner, the one of the n that it suits best: one fact, however many stood around. Who has been moved, and whose
+partner is whose, is for the estimators to say (`ctmap_gtsam.frontend.company`).
 """
 
 from __future__ import annotations
@@ -28,28 +37,25 @@ from scipy.special import gammaln
 
 from factors.symmetry import Symmetry, residual_jacobians
 from sequences import se3
+from sequences.options import option
 
 Array = NDArray[np.float64]
 
 _ROUNDS = 20
 _SETTLED = 1e-10
 _LEAST_M = 1e-6  # nearer to a's axis b has no azimuth
+_SAME_UP = 0.99  # cosine between up before and after a turn that leaves a thing standing as it stood
+_SHOWN = 0.5  # least share of an in-plane motion that the coordinates show
 
 
 @dataclass(frozen=True)
 class InstancePrior:
     """What is believed of a pair before it was seen: as if so many visits had shown such a spread."""
 
-    rotation_rad: float = 0.15
-    """standard deviation about each axis"""
-    translation_m: float = 0.05
-    """the same in each direction"""
-    visits: float = 2.0
-    """> 0; fewer give heavier tails"""
-    area_m2: float = 4.0
-    """of the background: where b may be around a, ..."""
-    height_m: float = 1.0
-    """... and how high and low together"""
+    rotation_rad: float = option(0.15, "standard deviation about each axis, rad", low=1e-3)
+    translation_m: float = option(0.05, "the same in each direction, metres", low=1e-4)
+    visits: float = option(2.0, "how many visits that is worth; fewer give heavier tails", low=0.1)
+    area_m2: float = option(4.0, "where else a thing that was moved may stand, square metres", low=1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +76,7 @@ class InstanceRelation:
     @property
     def log_peak(self) -> float:
         """log(phi_ins / phi_background) where the pair stands as it did on average, nats."""
-        d, k = len(self.precision), self.freedom
-        volume = 0.5 * np.linalg.slogdet(self.precision)[1] - 0.5 * d * np.log(k * np.pi)
-        return float(gammaln(0.5 * (k + d)) - gammaln(0.5 * k) + volume - self.log_background)
+        return _log_peak(self.precision, self.freedom) - self.log_background
 
 
 def instance_relation(
@@ -80,6 +84,7 @@ def instance_relation(
     T_b: ArrayLike,
     symmetry_a: Symmetry,
     symmetry_b: Symmetry,
+    up: ArrayLike,
     prior: InstancePrior | None = None,
 ) -> InstanceRelation:
     """What is learned from n visits, those in which the pair is not being scored.
@@ -89,6 +94,7 @@ def instance_relation(
         T_b: (n, 4, 4) the same.
         symmetry_a: of the first; it may have one free axis, not all.
         symmetry_b: of the second.
+        up: (3,) in the frame of the first visit.
         prior: None = the default.
     """
     prior = prior or InstancePrior()
@@ -112,9 +118,11 @@ def instance_relation(
     # of nu_0 = d + 1 + visits the prior's mean is Psi_0 / visits
     freedom = prior.visits + n + 2.0
     scale = (prior.visits * covariance + scatter) * (n + 1.0) / (n * freedom)
-    return InstanceRelation(
-        mean, basis, np.linalg.inv(scale), freedom, _background(mean, symmetry_a, symmetry_b, prior)
-    )
+    precision = np.linalg.inv(scale)
+    # the mean was found from the first visit's pose of b, and written in its frame
+    up_b = B[0, :3, :3].T @ np.asarray(up, dtype=np.float64)
+    background = _background(mean, basis, precision, freedom, up_b, symmetry_a, symmetry_b, prior)
+    return InstanceRelation(mean, basis, precision, freedom, background)
 
 
 def instance_log_ratio(
@@ -122,6 +130,13 @@ def instance_log_ratio(
 ) -> Array:
     """log(phi_ins / phi_background) (...) nats of poses (..., 4, 4), which broadcast: for `context_log_ratio`."""
     return instance_log_ratio_jacobians(T_a, T_b, relation, symmetry_a, symmetry_b)[0]
+
+
+def among_log_ratio(log_ratio: ArrayLike, candidates: ArrayLike) -> Array:
+    """The log of 1 - 1/n + phi_ins / (n phi_background) (...): of n that were moved as well, the partner is one."""
+    n = np.asarray(candidates, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.logaddexp(np.asarray(log_ratio, dtype=np.float64), np.log(n - 1.0)) - np.log(n))
 
 
 def instance_log_ratio_jacobians(
@@ -150,6 +165,13 @@ def instance_residual_jacobians(
     basis = relation.basis
     r, J_a, J_b = _residuals(A, B, relation.T_a_b, basis, relation.precision, symmetry_a, symmetry_b)
     return (basis @ r[..., None])[..., 0], basis @ J_a, basis @ J_b
+
+
+def _log_peak(precision: Array, freedom: float) -> float:
+    """log density of a Student t at its mode."""
+    d, k = len(precision), freedom
+    volume = 0.5 * np.linalg.slogdet(precision)[1] - 0.5 * d * np.log(k * np.pi)
+    return float(gammaln(0.5 * (k + d)) - gammaln(0.5 * k) + volume)
 
 
 def _residuals(
@@ -219,11 +241,46 @@ def _basis(mean: Array, symmetry_a: Symmetry, symmetry_b: Symmetry) -> Array:
     return np.asarray(left @ P)
 
 
-def _background(mean: Array, symmetry_a: Symmetry, symmetry_b: Symmetry, prior: InstancePrior) -> float:
-    """log density, in the reduced coordinates, of b anywhere in the volume around a, anyhow turned."""
-    log_density = -np.log(prior.area_m2 * prior.height_m) - symmetry_b.log_quotient_rotations + np.log(symmetry_a.order)
-    if symmetry_a.free:
-        out = se3.transform(mean, symmetry_b.centre[None])[0] - symmetry_a.centre
-        # a ring of azimuths is one: as long as it is round
-        log_density += np.log(2.0 * np.pi * max(float(np.linalg.norm(_across(symmetry_a) @ out)), _LEAST_M))
-    return float(log_density)
+def _background(
+    mean: Array,
+    basis: Array,
+    precision: Array,
+    freedom: float,
+    up_b: Array,
+    symmetry_a: Symmetry,
+    symmetry_b: Symmetry,
+    prior: InstancePrior,
+) -> float:
+    """log density, in the reduced coordinates, of b put down anywhere in the plane with any yaw.
+
+    It is as high and as tilted as the mean has it. Both have the density that the Student t gives them, so the ratio is
+    that of the t's conditional in the plane to a uniform one: itself a Student t, of more degrees of freedom.
+    """
+    in_plane = np.linalg.svd(up_b[None])[2][1:]
+    motions = np.zeros((6, 3))
+    motions[:3, 0], motions[3:, 0] = up_b, np.cross(symmetry_b.centre, up_b)
+    motions[3:, 1:] = in_plane.T
+    meant = int((np.linalg.svd(symmetry_b.projection @ motions)[1] > _SHOWN).sum())
+    axes, shares, _ = np.linalg.svd(basis @ motions, full_matrices=False)
+    axes, shares = axes[:, shares > _SHOWN], shares[shares > _SHOWN]
+    d, n = len(precision), len(shares)
+    sliced_freedom = freedom + d - n
+    sliced = axes.T @ precision @ axes * (sliced_freedom / freedom)
+    log_uniform = -np.log(prior.area_m2) - np.log(shares).sum()
+    log_uniform += np.log(_upright(symmetry_a, mean[:3, :3] @ up_b) * _upright(symmetry_b, up_b))
+    if meant == len(motions.T):
+        log_uniform -= np.log(2.0 * np.pi)
+    if n < meant:
+        log_uniform += _log_ring(mean, symmetry_a, symmetry_b)
+    return _log_peak(precision, freedom) - _log_peak(sliced, sliced_freedom) + float(log_uniform)
+
+
+def _upright(symmetry: Symmetry, up: Array) -> int:
+    """How many of the discrete symmetries are turns about the vertical (3,), given in the object's frame."""
+    return int((symmetry.discrete[:, :3, :3] @ up @ up > _SAME_UP).sum())
+
+
+def _log_ring(mean: Array, symmetry_a: Symmetry, symmetry_b: Symmetry) -> float:
+    """The log of the length of the ring of azimuths that are one: as long as it is round."""
+    out = se3.transform(mean, symmetry_b.centre[None])[0] - symmetry_a.centre
+    return float(np.log(2.0 * np.pi * max(float(np.linalg.norm(_across(symmetry_a) @ out)), _LEAST_M)))

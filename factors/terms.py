@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import context, measurement, mixture
+from factors import context, instance, measurement, mixture
 from factors.symmetry import NONE, Symmetry, gauge_residual, reduced_residual_jacobians, residual_jacobians
 from sequences import se3
 
@@ -216,3 +216,56 @@ class Contexts:
     def __getitem__(self, index: int) -> Contexts:
         """See `Terms`."""
         return Contexts(self.centres[index], self.pair[index], self.instance[index], self.keyframes[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Partners:
+    """phi_c between two objects that may have been moved together; see `factors.instance`. Keys as of `Contexts`."""
+
+    pair: context.PairMixture
+    """of their classes, (...)"""
+    relation: instance.InstanceRelation
+    """from the first to the second, one for all"""
+    symmetries: tuple[Symmetry, Symmetry]
+    """of both, about the origins of their frames, between which the distance is taken"""
+    candidates: Array
+    """(...) as of `instance.among_log_ratio`"""
+    keyframes: Array
+    """(...) over how many keyframes this one fact is spread"""
+
+    @property
+    def rows(self) -> int:
+        """See `Terms`."""
+        return 1 + len(self.relation.precision)
+
+    @cached_property
+    def whitener(self) -> Array:
+        """(d, d) root of the precision."""
+        return np.asarray(np.linalg.cholesky(self.relation.precision).T)
+
+    def linearised(self, values: Sequence[Array]) -> Linearised:
+        """See `Terms`."""
+        nowhere = np.zeros(3)
+        distance, *by_distance = context.pair_distance_jacobians(values[0], values[1], nowhere, nowhere)
+        peak = instance.among_log_ratio(self.relation.log_peak, self.candidates)
+        e, slope, _ = context.context_residual(distance, self.pair, peak)
+        x, *J = instance.instance_residual_jacobians(values[0], values[1], self.relation, *self.symmetries)
+        x = (self.whitener @ x[..., None])[..., 0]
+        J = [self.whitener @ own for own in J]
+        w2, k = self.pair.instance_weight, self.relation.freedom
+        left = replace(self.pair, strangers=self.pair.strangers + w2 * (1.0 - 1.0 / self.candidates))
+        log_gain = np.log(w2 / self.candidates) + self.relation.log_peak
+        square = (x * x).sum(axis=-1)
+        f, by_q, by_d = context.falling_residual(distance, left, square, k, 0.5 * (k + x.shape[-1]), log_gain)
+        share = 1.0 / np.sqrt(self.keyframes)
+        jacobians = []
+        for own, d in zip(J, by_distance, strict=True):
+            by_f = 2.0 * by_q[..., None] * (x[..., None, :] @ own)[..., 0, :] + by_d[..., None] * d
+            falling = f[..., None, None] * own + x[..., None] * by_f[..., None, :]
+            rows = [slope[..., None, None] * d[..., None, :], falling]
+            jacobians.append(share[..., None, None] * np.concatenate(rows, axis=-2))
+        return share[..., None] * np.concatenate([e[..., None], f[..., None] * x], axis=-1), tuple(jacobians)
+
+    def __getitem__(self, index: int) -> Partners:
+        """See `Terms`."""
+        return replace(self, pair=self.pair[index], candidates=self.candidates[index], keyframes=self.keyframes[index])

@@ -23,6 +23,7 @@ from ctmap_gtsam.filtering.diagnostics import Scored, diagnostics
 from ctmap_gtsam.filtering.history import one_past
 from ctmap_gtsam.filtering.identity import WAS_THERE, as_moved, at_place, moved_to, twin
 from ctmap_gtsam.frontend.association import Associator, Track
+from ctmap_gtsam.frontend.company import Stand, company
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
@@ -90,6 +91,12 @@ class Forward:
         self.reports: list[dict[int, Reported]] = []
         self.found_moved: list[tuple[int, tuple[int, int], float]] = []
         """object, times of its last detection at the old place and its first at the new one, P(it is the same)"""
+        self.visit = -1
+        """of the last keyframe"""
+        self.up_before: Array | None = None
+        """(3,) which way was up by the visits before"""
+        self.stood: dict[int, dict[int, Stand]] = {}
+        """visit -> object -> how it stood when it was last in view there; of those that surely were there"""
         self.scored = Scored()
 
     def step(self, observation: Observation, stage: Stage = SILENT_STAGE) -> None:
@@ -100,6 +107,8 @@ class Forward:
             stage: is told what parts take how long.
         """
         self.scored.begin()
+        if observation.frame.visit != self.visit:
+            self.visit, self.up_before = observation.frame.visit, self.place.up_world
         with timed(stage, "tracks and surfaces"):
             self.associator.step(observation)
             self.place.update(observation)
@@ -122,6 +131,7 @@ class Forward:
         reported = self._start(new, observation, reported, before, stage)
         self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
         self.reports.append(self._find_moved(self._merge(reported)))
+        self._remember(self.reports[-1])
 
     @contextmanager
     def _counted(self, i: int, stage: Stage, part: str) -> Iterator[None]:
@@ -200,6 +210,9 @@ class Forward:
             past = one_past(more.past, less.past)
             self.beliefs[old] = replace(more, object_id=old, first_ns=self.beliefs[old].first_ns, past=past)
             del self.beliefs[young]
+            for stands in self.stood.values():
+                if young in stands:
+                    stands.setdefault(old, stands.pop(young))
             self.owner |= {track: old for track, owner in self.owner.items() if owner == young}
         return dict(sorted(kept.items()))
 
@@ -211,12 +224,25 @@ class Forward:
             self.found_moved.append((i, between, same))
             self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.known[i])
             self.owner |= {track: i for track, owner in self.owner.items() if owner == found}
+            for stands in self.stood.values():
+                if found in stands:
+                    stands[i] = stands.pop(found)
             reported[i] = reported.pop(found)
         return reported
 
+    def _remember(self, reported: Mapping[int, Reported]) -> None:
+        """Take down how things in view stand, and strike out what of this visit is found not to be there."""
+        stands = self.stood.setdefault(self.visit, {})
+        for i, r in reported.items():
+            if r.visible:
+                stands.pop(i, None)
+                stands |= _stands({i: r}, NEIGHBOUR_PROBABILITY)
+
     def surroundings(self, reports: Mapping[int, Reported]) -> Surroundings:
         """What stands around, by what was reported."""
-        return Surroundings(self._neighbours(reports), self.place.surfaces)
+        earlier = [self.stood[visit] for visit in sorted(self.stood) if visit < self.visit]
+        partners = company(_stands(reports, 0.5), earlier, self.up_before, self.model) if earlier else {}
+        return Surroundings(self._neighbours(reports), self.place.surfaces, partners)
 
     def _neighbours(self, reports: Mapping[int, Reported]) -> tuple[Neighbour, ...]:
         """Objects that are sure of themselves, by their most likely particle."""
@@ -227,6 +253,15 @@ class Forward:
             and r.existence > NEIGHBOUR_PROBABILITY
             and r.class_probability[r.best_class] > NEIGHBOUR_PROBABILITY
         )
+
+
+def _stands(reports: Mapping[int, Reported], sure: float) -> dict[int, Stand]:
+    """How objects stand whose existence and class are both so sure."""
+    return {
+        i: Stand(r.best_class, r.best_pose)
+        for i, r in reports.items()
+        if r.best_pose is not None and min(r.existence, r.class_probability[r.best_class]) > sure
+    }
 
 
 def filtered(run: Run, state: Forward) -> Estimate:

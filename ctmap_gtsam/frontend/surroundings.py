@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.company import Company, Partner
 from ctmap_gtsam.frontend.observation import reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.scoring import Tile
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape, one_place_m
-from factors.context import context_log_ratio, context_residual, doubted, hinge_log_potential
+from factors.context import context_log_ratio, doubted, hinge_log_potential
 from sequences import se3
 from sequences.camera import Camera
 from sequences.geometry import Plane, plane_depth
@@ -60,6 +61,10 @@ class Surroundings:
     neighbours: tuple[Neighbour, ...]
     supports: tuple[Plane, ...]
     """level surfaces, world frame; empty where up is unknown"""
+    company: Company = field(default_factory=dict)
+    """who was moved together"""
+    partner: Partner | None = None
+    """of the object that this is around"""
     _surfaces: dict[int, tuple[tuple[Plane, Array], ...]] = field(default_factory=dict, repr=False, compare=False)
     """frame -> supports in its camera's frame and where in its image: the same for all objects, worked out once"""
 
@@ -67,7 +72,8 @@ class Surroundings:
         """The same for one object: it is not its own neighbour, nor are those that yield to it."""
         own = next((n for n in self.neighbours if n.object_id == object_id), None)
         others = (n for n in self.neighbours if n.object_id != object_id)
-        return replace(self, neighbours=tuple(n for n in others if own is None or not n.yields_to(own)))
+        around = tuple(n for n in others if own is None or not n.yields_to(own))
+        return replace(self, neighbours=around, partner=self.company.get(object_id))
 
     def beneath(self, tile: Tile, frame: Frame, box: Array) -> Tile:
         """The tile of a thing with a box (x, y, w, h), with known surfaces behind where this image alone shows none."""
@@ -93,28 +99,43 @@ class Surroundings:
         """The context potential of poses (K, 4, 4), nats (K,): once for a stationary episode. 0 without context."""
         if not model.context or not len(T_world_centre):
             return np.zeros(len(T_world_centre))
-        together = self._category(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre)
+        together = self._relations(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre)
         return together + support_log_potential(model, shape, T_world_centre, self.supports)
 
     def relations(self, model: Model, shape: Shape, T_world_centre: Array) -> dict[int, float]:
-        """What each related neighbour says of one pose (4, 4) by category, relative to its greatest value, nats.
+        """What each related neighbour, and a partner, says of one pose (4, 4), relative to its greatest value, nats.
 
         As the graph's factor for the pair says it, there spread over the keyframes that the two share.
         """
         out = {}
         for other in self.neighbours if model.context else ():
             pair = model.relations[shape.index, other.shape.index]
-            if pair.together > 0.0:
+            known = self._partnership(shape, other)
+            if pair.together > 0.0 or known is not None:
                 distance = np.linalg.norm(T_world_centre[:3, 3] - other.T_world_centre[:3, 3])
-                out[other.object_id] = float(-0.5 * context_residual(distance, pair)[0] ** 2)
+                said = context_log_ratio(distance, pair, self._instance(shape, T_world_centre[None], other)[0])
+                greatest = context_log_ratio(pair.usual_m, pair, 0.0 if known is None else known.log_peak)
+                out[other.object_id] = float(said - greatest)
         return out
 
-    def _category(self, model: Model, shape: Shape, T: Array) -> Array:
+    def _relations(self, model: Model, shape: Shape, T: Array) -> Array:
         total = np.zeros(len(T))
         for other in self.neighbours:
             distance = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
-            total += context_log_ratio(distance, model.relations[shape.index, other.shape.index])
+            related = model.relations[shape.index, other.shape.index]
+            total += context_log_ratio(distance, related, self._instance(shape, T, other))
         return total
+
+    def _instance(self, shape: Shape, T: Array, other: Neighbour) -> Array:
+        """What earlier visits, or other ones, say of a pair; 0 but for the one that was moved together."""
+        known = self._partnership(shape, other)
+        return np.zeros(len(T)) if known is None else known.log_ratio(shape, T, other.shape, other.T_world_centre)
+
+    def _partnership(self, shape: Shape, other: Neighbour) -> Partner | None:
+        """The partner where it is this neighbour, and both are of the classes that it is known of."""
+        of = other.object_id, (shape.index, other.shape.index)
+        own = self.partner
+        return own if own is not None and (own.object_id, own.classes) == of else None
 
     def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
         settings = model.config.context

@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.company import Company, Partner
 from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -25,7 +26,7 @@ from ctmap_gtsam.smoothing.batched import Batch, Problem
 from ctmap_gtsam.smoothing.solver import Solution, optimise
 from factors import symmetry
 from factors.custom import stay_factor, terms_factor
-from factors.terms import Contexts, Drifts, Gauges, Modes, Predictions
+from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions
 from sequences import se3
 from sequences.types import LocalisationNoise
 
@@ -305,6 +306,7 @@ def build(
     noise: LocalisationNoise,
     objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
     carried: Carried | None = None,
+    company: Mapping[int, Company] | None = None,
 ) -> SmootherGraph:
     """The graph of a run, or of a window of it.
 
@@ -315,6 +317,7 @@ def build(
         objects: object -> its class and chosen modes in order of time; of those before a window, the last one where its
             variable is carried, else none.
         carried: what came before the window; None where it is the whole run. Cameras are given from the first of all.
+        company: visit -> who was moved together; None = nobody.
     """
     built = SmootherGraph()
     first = 0
@@ -328,7 +331,7 @@ def build(
         built.objects[row] = shape.source.name
         _add_object(built, model, row, shape, measured, cameras)
     if model.context:
-        _add_context(built, model, objects, first)
+        _add_context(built, model, objects, first, company or {})
     return built
 
 
@@ -498,21 +501,49 @@ def _add_bias(built: SmootherGraph, model: Model, row: int, shape: Shape, visit:
 
 
 def _add_context(
-    built: SmootherGraph, model: Model, objects: Mapping[int, tuple[Shape, Sequence[Measured]]], first: int
+    built: SmootherGraph,
+    model: Model,
+    objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
+    first: int,
+    company: Mapping[int, Company],
 ) -> None:
-    """Category context of related pairs, one fact spread over the keyframes that they share."""
+    """Context of pairs that are related, or were moved together: one fact spread over the keyframes that they share."""
     pairs = []
     for a, b in combinations(sorted(objects), 2):
-        if model.relations[objects[a][0].index, objects[b][0].index].together > 0.0:
-            both = {m.keyframe for m in objects[a][1]} & {m.keyframe for m in objects[b][1]}
-            shared = sorted(k for k in both if k >= first)
-            pairs += [(a, b, k, len(shared)) for k in shared]
+        classes = objects[a][0].index, objects[b][0].index
+        visits = {m.keyframe: m.visit for m in objects[a][1]}
+        shared = [k for k in sorted({m.keyframe for m in objects[b][1]} & visits.keys()) if k >= first]
+        n = len(shared)
+        partners = {k: p for k in shared if (p := _partner(company.get(visits[k], {}), a, b, classes)) is not None}
+        for one in {id(p): p for p in partners.values()}.values():
+            _add_partners(built, model, (a, b), one, [k for k, p in partners.items() if p is one], n)
+        if model.relations[classes].together > 0.0:
+            pairs += [(a, b, k, n) for k in shared if k not in partners]
     if not pairs:
         return
     n = len(pairs)
-    classes = np.array([(objects[a][0].index, objects[b][0].index) for a, b, _, _ in pairs])
-    related = model.relations[classes[:, 0], classes[:, 1]]
+    of = np.array([(objects[a][0].index, objects[b][0].index) for a, b, _, _ in pairs])
+    related = model.relations[of[:, 0], of[:, 1]]
     terms = Contexts(np.zeros((n, 2, 3)), related, np.zeros(n), np.array([shared for *_, shared in pairs]))
     keys = np.array([(object_key(a, k), object_key(b, k)) for a, b, k, _ in pairs])
     names = tuple(f"objects {a} and {b} keyframe {k}" for a, b, k, _ in pairs)
     built.add_batch(Batch("context", names, keys, terms))
+
+
+def _partner(company: Company, a: int, b: int, classes: tuple[int, int]) -> Partner | None:
+    """What is known of a pair that was moved together, of these classes."""
+    partner = company.get(a)
+    return partner if partner is not None and (partner.object_id, partner.classes) == (b, classes) else None
+
+
+def _add_partners(
+    built: SmootherGraph, model: Model, pair: tuple[int, int], partner: Partner, at: list[int], shared: int
+) -> None:
+    """Context of a pair in a visit in which it was moved together, at its keyframes, of all that it shares."""
+    (a, c_a), (b, c_b) = list(zip(pair, partner.classes, strict=True))[:: 1 if partner.first else -1]
+    n = len(at)
+    related = model.relations[np.full(n, c_a), np.full(n, c_b)]
+    symmetries = model.shapes[c_a].symmetry, model.shapes[c_b].symmetry
+    terms = Partners(related, partner.relation, symmetries, np.full(n, float(partner.candidates)), np.full(n, shared))
+    names = tuple(f"objects {pair[0]} and {pair[1]} keyframe {k}" for k in at)
+    built.add_batch(Batch("context", names, np.array([(object_key(a, k), object_key(b, k)) for k in at]), terms))

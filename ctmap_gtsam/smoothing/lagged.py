@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.frontend.company import Company
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
@@ -35,7 +36,7 @@ from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.graph import Camera
 from ctmap_gtsam.smoothing.identity import duplicates, join_moved
 from ctmap_gtsam.smoothing.modes import Look, Recording, Sighting, Wanted, box_depths, in_world, look, sight
-from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
+from ctmap_gtsam.smoothing.rounds import camera_of, company_of, expected_of, neighbours_of, objects_of, wanted_of
 from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, remembered
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
@@ -151,6 +152,10 @@ class _Walk:
         self.twins: set[int] = set()
         """objects of the filter that have been found to be others"""
         self.cameras: list[Camera] = []
+        self.up_before: Array | None = None
+        """(3,) which way was up by the visits before"""
+        self.company: dict[int, Company] = {}
+        """visit -> who was moved together, by the keyframe before"""
         self.window = Window(lag + self.settings.window)
         self.tables = Tables(0, n, len(self.model.catalogue))
         self.rows: dict[int, int] = {}
@@ -169,9 +174,11 @@ class _Walk:
     def step(self, observation: Observation) -> None:
         """Take in a keyframe and say what is then believed of the one that lies the lag before."""
         k, before = observation.keyframe, self.things
+        self.cameras.append(camera_of(self.recording, k))
+        if k == 0 or self.cameras[-1].visit != self.cameras[-2].visit:
+            self.up_before = self.recording.place.up_world
         self.recording.place.update(observation)
         self.recent.append(observation)
-        self.cameras.append(camera_of(self.recording, k))
         now = {i: b for i, b in believed(self.forward, self.model, k).items() if i not in self.twins}
         self._let_go(now)
         new = now.keys() - self.objects.keys()
@@ -251,6 +258,11 @@ class _Walk:
             o.looks[k], o.sightings[k] = at, sight(at, self.proposer, wish)
         return at is not None or bool(fresh)
 
+    def _around(self, i: int, keyframe: int, there: Mapping[int, Thing]) -> Surroundings:
+        neighbours = neighbours_of(there, keyframe, self.model)
+        company = self.company.get(self.cameras[keyframe].visit, {})
+        return Surroundings(neighbours, self.recording.place.surfaces, company).without(i)
+
     def _wish(self, i: int, keyframe: int, b: Believed) -> Wanted:
         """What the filter believes in at a keyframe, and what the smoother does."""
         thing = self.objects[i].thing
@@ -280,7 +292,7 @@ class _Walk:
         for observation in self.recent:
             k = observation.keyframe
             wish = self._wish_at_first(o, k, b, known)
-            around = Surroundings(neighbours_of(there, k, self.model), self.recording.place.surfaces).without(i)
+            around = self._around(i, k, there)
             at = look(observation, self.recording.time_s(k), self.proposer, wish, o.boxes.get(k), around, last)
             if at is not None:
                 o.looks[k], o.sightings[k] = at, sight(at, self.proposer, wish)
@@ -331,7 +343,8 @@ class _Walk:
         things = {i: thing.with_poses(self._history(thing)) for i, thing in things.items()}
         first = self.window.first
         chosen = objects_of(things, self.recording, self.model)
-        smoothed, self.window = self.window.solve(self.model, self.cameras, self.recording.run.localisation, chosen)
+        noise = self.recording.run.localisation
+        smoothed, self.window = self.window.solve(self.model, self.cameras, noise, chosen, self.company)
         self.ends[smoothed.solution.end] += 1
         if self.solution is None or self.solution.end == "converged" or smoothed.solution.end != "converged":
             self.solution = smoothed.solution
@@ -339,6 +352,8 @@ class _Walk:
             # what more likely doesn't exist isn't smoothed, and where it was smoothed before is no guess for it
             poses = {**thing.poses, **smoothed.objects.get(i, {})} if thing.exists else {}
             things[i] = thing.with_poses({j: p for j, p in poses.items() if j in thing.sightings})
+        visits = [camera.visit for camera in self.cameras]
+        self.company = company_of(things, visits, self.up_before, self.model)
         for o in self.objects.values():
             _learn(o, things)
         last = k == len(self.recording.keyframes) - 1

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.company import Company, Stand, company
 from ctmap_gtsam.frontend.surroundings import Neighbour
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -56,6 +57,34 @@ def neighbours_of(things: Mapping[int, Thing], keyframe: int, model: Model) -> t
         for thing, pose in there
         if pose is not None
     )
+
+
+def company_of(
+    things: Mapping[int, Thing], visits: Sequence[int], up_world: Array | None, model: Model
+) -> dict[int, Company]:
+    """Who was moved together, by visit: each visit is held to how things stood in all others.
+
+    Args:
+        things: the map.
+        visits: (K,) of the keyframes.
+        up_world: (3,); None = unknown.
+        model: potentials and shapes.
+    """
+    stood: dict[int, dict[int, Stand]] = {visit: {} for visit in visits}
+    for i, thing in sorted(things.items()):
+        for k in sorted(thing.poses):
+            pose = thing.present_pose(k)
+            if pose is not None:
+                stood[visits[k]][i] = Stand(thing.best_class, pose)
+    return {
+        visit: company(now, [stands for other, stands in stood.items() if other != visit], up_world, model)
+        for visit, now in stood.items()
+    }
+
+
+def visits_of(recording: Recording) -> tuple[int, ...]:
+    """(K,) the visit of each keyframe."""
+    return tuple(recording.run.frames[int(f)].visit for f in recording.keyframes)
 
 
 def camera_of(recording: Recording, keyframe: int) -> Camera:

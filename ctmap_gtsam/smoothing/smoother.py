@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.frontend.company import Company, Partner
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
@@ -29,10 +30,19 @@ from ctmap_gtsam.smoothing.discrete import Posterior, Stage
 from ctmap_gtsam.smoothing.graph import Contributions, Measured, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
-from ctmap_gtsam.smoothing.rounds import camera_of, expected_of, neighbours_of, objects_of, wanted_of
+from ctmap_gtsam.smoothing.rounds import (
+    camera_of,
+    company_of,
+    expected_of,
+    neighbours_of,
+    objects_of,
+    visits_of,
+    wanted_of,
+)
 from ctmap_gtsam.smoothing.seeding import Seed, careful, seeds
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.writing import write
+from factors.instance import InstanceRelation
 from factors.symmetry import residual
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
@@ -55,6 +65,8 @@ class Map:
     """graph error by kind of factor, nats"""
     factors: Mapping[str, int]
     """number of factors by kind"""
+    company: Mapping[int, Company]
+    """visit -> who was moved together before it, by the round before"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +81,10 @@ class Rounds:
     """whether the last round changed nothing of note"""
 
 
-_KEPT = (Rounds, Map, Smoothed, Contributions, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior)
+_KEPT = (
+    *(Rounds, Map, Smoothed, Contributions, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior),
+    *(Partner, InstanceRelation),
+)
 """what `Rounds` is made of"""
 
 
@@ -119,7 +134,7 @@ def smooth_run(
         state = _stepped(following, state.energies, settled, proposer, checkpoint)
     current = state.current
     if look is not None:
-        built, objects = _graph(recording, model, current.things)
+        built, objects = _graph(recording, model, current.things, current.company)
         look(built, smooth(built, model, objects, len(recording.keyframes)))
     estimate = write(recording, model, current.things, current.smoothed, _diagnostics(proposer, state))
     if checkpoint is not None:
@@ -175,12 +190,14 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
         return Surroundings(tuple(n for n in there if n is not None), recording.place.surfaces)
 
     sightings = gather(recording, proposer, wanted, boxes, around, progress, "round 1")
-    return _solve(recording, model, boxes, sightings)
+    return _solve(recording, model, boxes, sightings, {})
 
 
 def _next_round(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Map:
     """Start from the smoothed map; every object's background is the map of the others."""
     model = proposer.model
+    visits = visits_of(recording)
+    company = company_of(current.things, visits, recording.place.up_world, model)
 
     def expected(i: int, k: int) -> Expected | None:
         return expected_of(current.things[i], k)
@@ -190,11 +207,11 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
         return wanted_of(thing, k, recording, model, thing.sightings.get(k))
 
     def around(k: int) -> Surroundings:
-        return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces)
+        return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces, company[visits[k]])
 
     boxes = associate(recording, model, current.things, expected)
     sightings = gather(recording, proposer, wanted, boxes, around, progress, name)
-    return _solve(recording, model, boxes, sightings)
+    return _solve(recording, model, boxes, sightings, company)
 
 
 def _solve(
@@ -202,24 +219,27 @@ def _solve(
     model: Model,
     boxes: Mapping[int, Boxes],
     sightings: Mapping[int, Mapping[int, Sighting]],
+    company: Mapping[int, Company],
 ) -> Map:
     """Trellis for every object, identities over gaps, then one graph."""
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, recording, model), recording, model)
-    built, objects = _graph(recording, model, things)
+    built, objects = _graph(recording, model, things, company)
     smoothed = smooth(built, model, objects, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
     energy = built.energy(smoothed.solution.values)
     # the arrays are all that anybody needs from here on, and GTSAM's values can't be kept
     smoothed = replace(smoothed, solution=replace(smoothed.solution, values=None))
-    return Map(things, smoothed, energy, built.count())
+    return Map(things, smoothed, energy, built.count(), company)
 
 
-def _graph(recording: Recording, model: Model, things: Mapping[int, Thing]) -> tuple[SmootherGraph, Objects]:
+def _graph(
+    recording: Recording, model: Model, things: Mapping[int, Thing], company: Mapping[int, Company]
+) -> tuple[SmootherGraph, Objects]:
     """The graph of all that is, and what each object was taken for."""
     cameras = [camera_of(recording, k) for k in range(len(recording.keyframes))]
     objects = objects_of(things, recording, model)
-    return build(model, cameras, recording.run.localisation, objects), objects
+    return build(model, cameras, recording.run.localisation, objects, company=company), objects
 
 
 def _settled(a: Map, b: Map, model: Model) -> bool:

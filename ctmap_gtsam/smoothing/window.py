@@ -15,6 +15,7 @@ from typing import Any
 
 import gtsam
 
+from ctmap_gtsam.frontend.company import Company
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.graph import (
@@ -52,7 +53,12 @@ class Window:
         return 0 if self.carried is None else self.carried.first
 
     def solve(
-        self, model: Model, cameras: Sequence[Camera], noise: LocalisationNoise, objects: Objects
+        self,
+        model: Model,
+        cameras: Sequence[Camera],
+        noise: LocalisationNoise,
+        objects: Objects,
+        company: Mapping[int, Company] | None = None,
     ) -> tuple[Smoothed, Window]:
         """Solve the window up to the last camera, and slide it so that the next keyframe fits in.
 
@@ -62,6 +68,7 @@ class Window:
             noise: of the recorded poses.
             objects: object -> its class and chosen modes in order of time; older ones than the window are not used but
                 to see whether what was carried of the object still holds.
+            company: visit -> who was moved together; None = nobody.
 
         Returns:
             The solution, whose cameras begin at `first`, and the next window.
@@ -69,7 +76,7 @@ class Window:
         window = self._without([i for i in self.left if not self._holds(i, objects.get(i))])
         inside = {i: (shape, window._inside(i, measured)) for i, (shape, measured) in objects.items()}
         inside = {i: entry for i, entry in inside.items() if entry[1]}
-        built = build(model, cameras, noise, inside, window.carried)
+        built = build(model, cameras, noise, inside, window.carried, company)
         smoothed = smooth(built, model, inside, len(cameras), self.first)
         begin = len(cameras) + 1 - self.length
         return smoothed, window._slid(begin, built, smoothed.solution.values, inside, cameras)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 
 from factors import context, prediction
-from factors.terms import Contexts, Drifts, Gauges, Modes, Predictions
+from factors.instance import among_log_ratio, instance_log_ratio, instance_relation
+from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions
 from sequences import se3
 from tests.factors.strategies import SEEDS, SYMMETRIES, numerical_jacobian, random_image, random_pose, random_spd
 
@@ -105,3 +106,39 @@ def test_contexts_of_different_pairs(seed):
     pairs = context.PairMixture(*parts, relations[0].instance_weight)
     terms = Contexts(rng.normal(0, 0.1, (N, 2, 3)), pairs, rng.normal(size=N), rng.integers(1, 9, N))
     assert_one_by_one(terms, [some(rng, random_pose), some(rng, random_pose)])
+
+
+@pytest.mark.parametrize("first", ["none", "box", "axis"])
+@pytest.mark.parametrize("second", ["none", "cylinder", "ball"])
+@given(SEEDS)
+@settings(max_examples=4, deadline=None)
+def test_partners_have_the_energy_of_the_context(first, second, seed):
+    """The residual's energy is peak - log(w1 phi_cat + w2 phi_ins) to the last digit, and its Jacobians are true."""
+    rng = np.random.default_rng(seed)
+    a, b = SYMMETRIES[first], SYMMETRIES[second]
+    A = some(rng, random_pose)
+    apart = random_pose(rng)
+    apart[:3, 3] += 0.4 * np.sign(apart[:3, 3])
+    relation = instance_relation(A[:2], near(rng, A[:2] @ apart, 0.1), a, b, np.array([0.0, 0.0, 1.0]))
+    values = [A, near(rng, A @ relation.T_a_b, 0.2)]
+    values[1][0] = A[0] @ relation.T_a_b  # at the peak
+    relations = [context.pair_mixture(context.Relation(p, 0.5, 0.8), 6.0) for p in rng.uniform(0.0, 0.9, N)]
+    parts = np.array([(p.strangers, p.together, p.usual_m, p.sigma_m) for p in relations]).T
+    pairs = context.PairMixture(*parts, relations[0].instance_weight)
+    candidates, keyframes = rng.integers(1, 9, N).astype(float), rng.integers(1, 9, N).astype(float)
+    terms = Partners(pairs, relation, (a, b), candidates, keyframes)
+    assert_one_by_one(terms, values)
+    r, jacobians = terms.linearised(values)
+    distance = context.pair_distance(*values, np.zeros(3), np.zeros(3))
+    instance = among_log_ratio(instance_log_ratio(*values, relation, a, b), candidates)
+    *_, peak = context.context_residual(distance, pairs, among_log_ratio(relation.log_peak, candidates))
+    energy = (peak - context.context_log_ratio(distance, pairs, instance)) / keyframes
+    np.testing.assert_allclose(0.5 * (r**2).sum(axis=-1), energy, atol=1e-12)
+    for i in (0, 1):
+        for j in range(2):
+
+            def alone(T, i=i, j=j):
+                there = [np.broadcast_to(value[i], T.shape) for value in values]
+                return terms[i].linearised([T, there[1]] if j == 0 else [there[0], T])[0]
+
+            np.testing.assert_allclose(jacobians[j][i], numerical_jacobian(alone, values[j][i]), atol=2e-5)
