@@ -206,7 +206,8 @@ class Forward:
         for i, (found, same) in moved.items():
             between = self.beliefs[i].present_ns, self.beliefs[found].first_ns
             self.found_moved.append((i, between, same))
-            self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.known[i])
+            old, new = self.beliefs[i], self.beliefs.pop(found)
+            self.beliefs[i] = as_moved(old, new, self.known[i], self.model, self.place.surfaces)
             self.owner |= {track: i for track, owner in self.owner.items() if owner == found}
             reported[i] = reported.pop(found)
         return reported
@@ -264,8 +265,12 @@ def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame
         for a, b in pairwise(seen):
             if times[b] - times[a] < significant_ns or _within(state.found_moved, i, times[a], times[b]):
                 continue
-            end = max(k for k in seen if frames[k].visit == frames[b].visit)
-            tables.move(row, (a, b), state.reports[end][i].elsewhere, (int(times[a]), int(times[b])))
+            after = [state.reports[k][i] for k in seen if k >= b and frames[k].visit == frames[b].visit]
+            elsewhere = after[-1].elsewhere
+            # nearby: as believed when the visit ends, or the next absence in it begins
+            nearby = [r.moved for r in after if r.returned_ns == times[b]]
+            moved = elsewhere + (1.0 - elsewhere) * (nearby[-1] if nearby else 0.0)
+            tables.move(row, (a, b), moved, (int(times[a]), int(times[b])))
 
 
 def _within(found: Sequence[tuple[int, tuple[int, int], float]], i: int, begin: int, end: int) -> bool:
