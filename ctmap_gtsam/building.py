@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 POTENTIALS = ("depth", "detection", "class", "prediction", "persistence", "context", "support")
 
 
-_NO_SUPPORT = -(1 << 31)  # of Estimate.moves: not known
+NO_SUPPORT = -(1 << 31)
+"""of Estimate.moves: not known"""
 
 
 @dataclass
@@ -61,7 +62,7 @@ class Tables:
 
     def move(self, row: int, gap: tuple[int, int], probability: float, times_ns: tuple[int, int]) -> None:
         """Add P(moved) for the gap between two keyframes, with the times between which it would have been."""
-        self.moves.append((row, gap, probability, times_ns, _NO_SUPPORT, _NO_SUPPORT))
+        self.moves.append((row, gap, probability, times_ns, NO_SUPPORT, NO_SUPPORT))
 
     def note(self, row: int, keyframe: int, potential: str, nats: float, other: int = -1) -> None:
         """Add a line of the ledger."""

@@ -39,6 +39,7 @@ from ctmap_gtsam.filtering.filter import Forward, forward
 from ctmap_gtsam.filtering.history import Kept, Past, Stage
 from ctmap_gtsam.filtering.particles import Particles, Spread, modes_of, systematic, transition_log_density
 from ctmap_gtsam.frontend.place import describe
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -491,7 +492,7 @@ def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
             tables.move(objects.index(i), gap, same, between)
     told = diagnostics(objects, state.reports, state.scored)
     told["objects"]["smoothed_sample_size"] = writer.sizes
-    return build_estimate(
+    estimate = build_estimate(
         run,
         state.model.config,
         "ffbsi-ct" if state.model.context else "ffbsi-t",
@@ -502,3 +503,4 @@ def _estimate(run: Run, state: Forward, progress: Progress) -> Estimate:
         np.tile(localisation_covariance(run.localisation), (len(writer.frames), 1, 1)),
         {"diagnostics": told, **describe(state.place)},
     )
+    return with_supports(estimate, state.model, [state.place.surfaces] * len(state.keyframes))

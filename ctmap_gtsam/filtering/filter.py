@@ -27,8 +27,10 @@ from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
+from sequences.geometry import Plane
 from sequences.progress import SILENT, SILENT_STAGE, Progress, Stage, timed
 from sequences.types import Detection, Frame, Run
 
@@ -90,6 +92,8 @@ class Forward:
         self.reports: list[dict[int, Reported]] = []
         self.found_moved: list[tuple[int, tuple[int, int], float]] = []
         """object, times of its last detection at the old place and its first at the new one, P(it is the same)"""
+        self.surfaces: list[tuple[Plane, ...]] = []
+        """level surfaces at each keyframe, as far as they were known"""
         self.scored = Scored()
 
     def step(self, observation: Observation, stage: Stage = SILENT_STAGE) -> None:
@@ -103,6 +107,7 @@ class Forward:
         with timed(stage, "tracks and surfaces"):
             self.associator.step(observation)
             self.place.update(observation)
+            self.surfaces.append(self.place.surfaces)
         before = self.reports[-1] if self.reports else {}
         surroundings = self.surroundings(before)
         tracks = self.associator.tracks()
@@ -237,7 +242,7 @@ def _estimate(run: Run, state: Forward) -> Estimate:
             r.write(tables, rows[i], k, model)
     frames = [run.frames[int(f)] for f in keyframes]
     _write_moves(tables, rows, frames, state)
-    return build_estimate(
+    estimate = build_estimate(
         run,
         model.config,
         "filter-ct" if model.context else "filter-t",
@@ -251,6 +256,7 @@ def _estimate(run: Run, state: Forward) -> Estimate:
             **describe(state.place),
         },
     )
+    return with_supports(estimate, model, state.surfaces, settled=True)
 
 
 def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame], state: Forward) -> None:

@@ -26,6 +26,7 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import one_place_m
@@ -40,6 +41,7 @@ from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, rem
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
 from ctmap_gtsam.smoothing.writing import Told, note_class, write_at
+from sequences.geometry import Plane
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
@@ -152,6 +154,8 @@ class _Walk:
         """objects of the filter that have been found to be others"""
         self.cameras: list[Camera] = []
         self.window = Window(lag + self.settings.window)
+        self.surfaces: list[tuple[Plane, ...]] = []
+        """at each keyframe"""
         self.tables = Tables(0, n, len(self.model.catalogue))
         self.rows: dict[int, int] = {}
         """object -> row of the tables"""
@@ -170,6 +174,7 @@ class _Walk:
         """Take in a keyframe and say what is then believed of the one that lies the lag before."""
         k, before = observation.keyframe, self.things
         self.recording.place.update(observation)
+        self.surfaces.append(self.recording.place.surfaces)
         self.recent.append(observation)
         self.cameras.append(camera_of(self.recording, k))
         now = {i: b for i, b in believed(self.forward, self.model, k).items() if i not in self.twins}
@@ -375,7 +380,7 @@ class _Walk:
         }
         if self.solution is not None:
             diagnostics["solver"] = {"end": self.solution.end, "trace": list(self.solution.trace)}
-        return build_estimate(
+        estimate = build_estimate(
             self.recording.run,
             self.model.config,
             method,
@@ -386,6 +391,9 @@ class _Walk:
             self.camera_covariance,
             {"diagnostics": diagnostics, **describe(self.recording.place)},
         )
+        last = len(self.surfaces) - 1
+        said = [self.surfaces[min(k + self.lag, last)] for k in range(len(self.surfaces))]
+        return with_supports(estimate, self.model, said)
 
 
 def _learn(o: _Object, things: Mapping[int, Thing]) -> None:

@@ -12,6 +12,7 @@ from ctmap_gtsam.building import Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.place import describe
 from ctmap_gtsam.frontend.proposer import FLAT_M
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -39,7 +40,7 @@ def write(
         for k in range(len(recording.keyframes)):
             write_at(tables, row, k, thing, told, smoothed.T_world_camera[k])
         note_class(tables, row, thing)
-    return build_estimate(
+    estimate = build_estimate(
         recording.run,
         model.config,
         "smooth-ct" if model.context else "smooth-t",
@@ -50,6 +51,7 @@ def write(
         smoothed.camera_covariance,
         {"diagnostics": diagnostics, **describe(recording.place)},
     )
+    return with_supports(estimate, model, [recording.place.surfaces] * len(recording.keyframes))
 
 
 @dataclass(frozen=True)
