@@ -26,7 +26,8 @@ POTENTIALS = (
 )
 """see docs/format.md"""
 
-_NO_SUPPORT = -(1 << 31)  # of Estimate.moves: not known
+NO_SUPPORT = -(1 << 31)
+"""of Estimate.moves: not known"""
 
 
 @dataclass
@@ -67,7 +68,7 @@ class Tables:
 
     def move(self, row: int, gap: tuple[int, int], probability: float, times_ns: tuple[int, int]) -> None:
         """Add P(moved) for the gap between two keyframes, with the times between which it would have been."""
-        self.moves.append((row, gap, probability, times_ns, _NO_SUPPORT, _NO_SUPPORT))
+        self.moves.append((row, gap, probability, times_ns, NO_SUPPORT, NO_SUPPORT))
 
     def note(self, row: int, keyframe: int, potential: str, nats: float, other: int = -1) -> None:
         """Add a line of the ledger; row -1 is no object's, other -1 no neighbour's."""

@@ -83,6 +83,7 @@ class Prediction:
     )
     stay_limit: float = option(0.5, "r1 of Equation 2: P(stay) after an endless absence", low=0.0, high=1.0)
     significant_period_s: float = option(10.0, "absences shorter than this can't hold a move, s", low=0.0)
+    landing_tilt_rad: float = option(0.1, "how far from flat on its face a thing put down may seem, rad", low=1e-3)
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,18 @@ of the stay density (per rad^3 m^3), that is
     1/(N-1) . 1/Area_j . 1/2 pi . p(stable face) . N(height above the surface) N(tilt out of the face's normal)
 
 in which position (2), yaw (1), height (1) and tilt (2) make the six dimensions. Without a common unit, stay against
-move would be settled by the choice of metres or millimetres. Where no support is known, a moved object is within a
-broad Gaussian of where it was, in any orientation.
+move would be settled by the choice of metres or millimetres. Like every density over poses it is one over poses modulo
+the object's symmetries: the sum over all poses that look the same.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import i0e
 
-from factors.mixture import LOG_2PI, LOG_ROTATIONS
+from factors.mixture import LOG_2PI, log_sum
+from factors.symmetry import NONE, Symmetry
 
 Array = NDArray[np.float64]
 
@@ -78,65 +80,72 @@ def _known(dt_s: ArrayLike, mu_s: ArrayLike, r1: float, r2: float) -> Array:
     return np.where(np.asarray(dt_s) > 0, stay_probability(dt_s, mu_s, r1, r2), 1.0)
 
 
-def move_log_density(
+def facing_log_density(
+    up: ArrayLike,
+    faces_up: ArrayLike,
+    log_face: ArrayLike,
+    *,
+    tilt_sigma_rad: ArrayLike,
+    symmetry: Symmetry = NONE,
+) -> Array:
+    """The log density of the direction that is up, of an object that has come to rest on one of its stable faces.
+
+    A mixture of von Mises-Fisher densities, which are Gaussians N(tilt) in the chord between two directions and have
+    the mass 1 on the sphere. It is the same for all equivalent poses: the mean over the object's symmetries.
+
+    Args:
+        up: (..., 3) unit, against gravity, in the object's axes.
+        faces_up: (R, 3) unit, what is up when it rests on each face.
+        log_face: (R,) log probabilities that it comes to rest on each.
+        tilt_sigma_rad: (...) how exactly tilts are known.
+        symmetry: of the object.
+
+    Returns:
+        (...) nats, per steradian.
+    """
+    direction, kappa = np.asarray(up, dtype=np.float64), np.asarray(tilt_sigma_rad, dtype=np.float64)[..., None] ** -2.0
+    faces, weight = np.asarray(faces_up, dtype=np.float64), np.asarray(log_face, dtype=np.float64)
+    if symmetry.free == 3:
+        return np.full(direction.shape[:-1], -np.log(4.0 * np.pi))
+    images = np.swapaxes(symmetry.discrete[:, :3, :3], -1, -2) @ faces[:, None, :, None]
+    faces, weight = images.reshape(-1, 3), np.repeat(weight, symmetry.order) - np.log(symmetry.order)
+    if symmetry.free == 1:
+        # the mean over all turns about the axis, in closed form
+        axis = symmetry.free_rotations[:, 0]
+        a, b = direction @ axis, faces @ axis
+        across = np.sqrt(np.maximum(1.0 - a**2, 0.0))[..., None] * np.sqrt(np.maximum(1.0 - b**2, 0.0))
+        exponent = kappa * (a[..., None] * b + across - 1.0) + np.log(i0e(kappa * across))
+    else:
+        exponent = kappa * (direction @ faces.T - 1.0)
+    constant = np.log(kappa) - LOG_2PI - np.log1p(-np.exp(-2.0 * kappa))
+    return log_sum(weight + constant + exponent)
+
+
+def landing_log_density(
     others: ArrayLike,
     area_m2: ArrayLike,
-    log_face: ArrayLike,
+    log_facing: ArrayLike,
     height_m: ArrayLike,
-    tilt_rad: ArrayLike,
     *,
-    height_sigma_m: float,
-    tilt_sigma_rad: float,
-    yaw_order: ArrayLike = 1,
+    height_sigma_m: ArrayLike,
+    symmetry: Symmetry = NONE,
 ) -> Array:
     """The log density of landing on one supporter, given a move.
 
     Args:
         others: (...) N - 1, how many places there are to be moved to, >= 1.
         area_m2: (...) of the supporter's surface; inf for a pose outside it gives -inf.
-        log_face: (...) log probability that the object comes to rest on this face.
-        height_m: (...) of the face above the surface.
-        tilt_rad: (..., 2) rotation that would bring the face flat onto the surface.
-        height_sigma_m: how exactly heights are known.
-        tilt_sigma_rad: how exactly tilts are known.
-        yaw_order: (...) how many turns about the vertical look the same; 0 = all do, which leaves no yaw to have a
-            density.
+        log_facing: (...) from `facing_log_density`: which face it rests on, and how flat.
+        height_m: (...) of its lowest point above the surface.
+        height_sigma_m: (...) how exactly heights are known.
+        symmetry: of the object.
 
     Returns:
-        (...) nats, per rad^3 m^3 (per rad^2 m^3 for yaw_order 0).
+        (...) nats, per rad^3 m^3 of poses modulo the object's symmetries.
     """
-    order = np.asarray(yaw_order, dtype=np.float64)
-    yaw = np.where(order > 0, np.log(np.maximum(order, 1.0)) - LOG_2PI, 0.0)
     place = -np.log(np.asarray(others, dtype=np.float64)) - np.log(np.asarray(area_m2, dtype=np.float64))
-    height = _log_normal(np.asarray(height_m, dtype=np.float64)[..., None], height_sigma_m)
-    tilt = _log_normal(np.asarray(tilt_rad, dtype=np.float64), tilt_sigma_rad)
-    return place + yaw + np.asarray(log_face, dtype=np.float64) + height + tilt
-
-
-def move_log_density_gradients(
-    height_m: ArrayLike, tilt_rad: ArrayLike, *, height_sigma_m: float, tilt_sigma_rad: float
-) -> tuple[Array, Array]:
-    """Derivatives of `move_log_density` by height (...) and tilt (..., 2); it is flat along position and yaw."""
-    height, tilt = np.asarray(height_m, dtype=np.float64), np.asarray(tilt_rad, dtype=np.float64)
-    return -height / height_sigma_m**2, -tilt / tilt_sigma_rad**2
-
-
-def unsupported_move_log_density(
-    displacement_m: ArrayLike, *, sigma_m: float, log_rotations: float = LOG_ROTATIONS
-) -> Array:
-    """The log density of a move where no support is known.
-
-    Args:
-        displacement_m: (..., 3) from where the object was.
-        sigma_m: how far things are carried.
-        log_rotations: `Symmetry.log_quotient_rotations` of the object: every orientation is as likely.
-
-    Returns:
-        (...) nats; its derivative by the displacement is -displacement / sigma_m^2.
-    """
-    return _log_normal(np.asarray(displacement_m, dtype=np.float64), sigma_m) - log_rotations
-
-
-def _log_normal(x: Array, sigma: float) -> Array:
-    """Isotropic Gaussian over the last axis."""
-    return -0.5 * (x**2).sum(axis=-1) / sigma**2 - x.shape[-1] * (np.log(sigma) + 0.5 * LOG_2PI)
+    height, sigma = np.asarray(height_m, dtype=np.float64), np.asarray(height_sigma_m, dtype=np.float64)
+    above = -0.5 * (height / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_2PI
+    # any yaw: a rotation is the direction that is up, 4 pi sr, and a turn about it; equivalent poses are one
+    turned = np.log(4.0 * np.pi) - symmetry.log_quotient_rotations
+    return np.asarray(place + turned + np.asarray(log_facing, dtype=np.float64) + above)

@@ -39,6 +39,7 @@ from ctmap_gtsam.filtering.filter import Forward, forward
 from ctmap_gtsam.filtering.history import Kept, Past, Stage
 from ctmap_gtsam.filtering.particles import Particles, Spread, modes_of, systematic, transition_log_density
 from ctmap_gtsam.frontend.place import describe
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -95,8 +96,8 @@ class _Line:
 
     T_world_centre: Array
     """(n, 4, 4)"""
-    may_jump: NDArray[np.bool_]
-    """(n,) which may have come there from anywhere nearby"""
+    log_elsewhere: Array
+    """(n,) log density of having come there from elsewhere; -inf where that can't be"""
     carried: NDArray[np.bool_]
     """(n,) which have no past among the particles"""
 
@@ -104,7 +105,7 @@ class _Line:
         """With some that begin at a set of particles."""
         return _Line(
             np.concatenate([self.T_world_centre, particles.T_world_centre[picks]]),
-            np.append(self.may_jump, kept.may_jump[picks]),
+            np.append(self.log_elsewhere, kept.log_elsewhere[picks]),
             np.append(self.carried, np.zeros(len(picks), dtype=np.bool_)),
         )
 
@@ -115,10 +116,9 @@ class _Link:
 
     spread: Spread | None
     """None: not at all"""
-    log_elsewhere: float
-    """log density of coming from anywhere nearby, where that is possible"""
-    joins: bool
-    """those before are of another belief: what doesn't come from them by the prediction doesn't come from them"""
+    log_joined: float | None
+    """those before are of another belief: what doesn't come from them by the prediction doesn't come from them, and
+    comes with this log density from anywhere nearby; None: they are of the same one"""
     walked: Array
     """(6,) standard deviations of the prediction alone, without localisation's error"""
 
@@ -149,7 +149,7 @@ class Tracer:
         begin = self._beginning([j for j, _ in sets], last, self._rng(object_id, c, stages[-1]).random())
         particles: dict[int, Particles] = {}
         elsewhere: dict[int, float] = {}
-        line = _Line(np.zeros((0, 4, 4)), np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.bool_))
+        line = _Line(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, dtype=np.bool_))
         for m, (j, kept) in reversed(list(enumerate(sets))):
             rng, seen = self._rng(object_id, c, stages[j]), []
             if len(line.carried):
@@ -178,12 +178,12 @@ class Tracer:
     def _link(self, earlier: Stage, later: Stage, after: Kept, c: int) -> _Link:
         shape, settings = self.model.shapes[c], self.model.config.prediction
         dt = (later.time_ns - earlier.time_ns) * 1e-9
-        spread, joins = after.spread, False
+        spread, joined = after.spread, None
         if spread is None and later.joins:
-            spread, joins = predicted_spread(self.model, self.localisation, dt, later.away_m), True
-        log_elsewhere = float(np.log(settings.jump_probability)) + self.model.log_uniform(shape)
+            spread = predicted_spread(self.model, self.localisation, dt, later.away_m)
+            joined = float(np.log(settings.jump_probability)) + self.model.log_uniform(shape)
         walked = np.sqrt(np.diag(self.model.prediction_covariance(max(dt, 1e-3))))
-        return _Link(spread, log_elsewhere, joins, walked)
+        return _Link(spread, joined, walked)
 
     def _rng(self, object_id: int, c: int, stage: Stage) -> np.random.Generator:
         name = f"ffbsi.{self.model.shapes[c].source.obj_id}"
@@ -199,7 +199,7 @@ def step_back(
     uniform, normal = rng.random((n, 2)), rng.normal(size=(n, 6))
     # what has no past is carried by the prediction, which is the same forth and back
     T = se3.retract(line.T_world_centre, link.walked * normal)
-    may_jump, carried, jumped = np.zeros(n, dtype=np.bool_), line.carried.copy(), np.zeros(n)
+    elsewhere, carried, jumped = np.full(n, -np.inf), line.carried.copy(), np.zeros(n)
     on = np.flatnonzero(~line.carried)
     if link.spread is None:
         carried[:] = True
@@ -207,27 +207,25 @@ def step_back(
         density = transition_log_density(earlier.T_world_centre, line.T_world_centre[on], link.spread, shape)
         joint = earlier.log_weight + density
         stayed = logsumexp(joint, axis=1)
-        possible = link.joins | line.may_jump[on]
-        with np.errstate(divide="ignore"):
-            jump = link.log_elsewhere + np.log(possible.astype(np.float64))
+        jump = line.log_elsewhere[on] if link.log_joined is None else np.full(len(on), link.log_joined)
         jumped[on] = np.exp(jump - np.logaddexp(stayed, jump))
         jumps = uniform[on, 0] < jumped[on]
         kernel = np.exp(joint - stayed[:, None])
         share = (1.0 - jumped[on]) @ kernel
         picks = _pick(kernel, uniform[on, 1])
         weight = np.exp(earlier.log_weight)
-        if link.joins:
+        if link.log_joined is not None:
             carried[on[jumps]] = True
         else:
             share += jumped[on].sum() * weight
             picks[jumps] = _pick(np.broadcast_to(weight, (int(jumps.sum()), len(weight))), uniform[on[jumps], 1])
         kept = on[~carried[on]]
         T[kept] = earlier.T_world_centre[picks[~carried[on]]]
-        may_jump[kept] = before.may_jump[picks[~carried[on]]]
+        elsewhere[kept] = before.log_elsewhere[picks[~carried[on]]]
     seen = Particles(
         np.concatenate([earlier.T_world_centre, T[carried]]), _log(np.append(share, np.ones(int(carried.sum()))))
     )
-    return _Line(T, may_jump, carried), _compressed(seen), float(jumped.mean())
+    return _Line(T, elsewhere, carried), _compressed(seen), float(jumped.mean())
 
 
 def _pick(weights: Array, uniform: Array) -> NDArray[np.int64]:
@@ -496,7 +494,7 @@ def traced_back(run: Run, state: Forward, progress: Progress) -> Estimate:
             tables.move(objects.index(i), gap, same, between)
     told = diagnostics(objects, state.reports, state.scored)
     told["objects"]["smoothed_sample_size"] = writer.sizes
-    return build_estimate(
+    estimate = build_estimate(
         run,
         state.model.config,
         "ffbsi-ct" if state.model.context else "ffbsi-t",
@@ -507,3 +505,4 @@ def traced_back(run: Run, state: Forward, progress: Progress) -> Estimate:
         np.tile(localisation_covariance(run.localisation), (len(writer.frames), 1, 1)),
         {"diagnostics": told, **describe(state.place)},
     )
+    return with_supports(estimate, state.model, [state.place.surfaces] * len(state.keyframes))

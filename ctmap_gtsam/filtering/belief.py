@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from ctmap_gtsam.filtering.particles import (
     predicted_log_density,
 )
 from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.frontend.observation import Observation
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer, View
 from ctmap_gtsam.frontend.surroundings import Surroundings
@@ -32,6 +33,7 @@ from ctmap_gtsam.shapes import Shape
 from factors import mixture, prediction, symmetry
 from factors.measurement import box_iou
 from factors.mixture import log_sum
+from sequences.geometry import Plane
 from sequences.seeds import generator
 from sequences.types import Detection, LocalisationNoise
 
@@ -43,6 +45,7 @@ _DORMANT = (45.0, 0.25)  # nats behind the best class, and share of its evidence
 _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighed and searched for
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
 _LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
+_ASKED = 8  # particles of which it is asked whether they came by a move
 _IN_SIGHT = 0.8  # least visible share of what has jumped and isn't detected
 
 REPORTED = 0.01
@@ -69,6 +72,19 @@ class Glimpse:
     """(4, 4)"""
     waited_s: float | None
     """since the keyframe in view before; None where it is the first"""
+
+
+@dataclass(frozen=True)
+class Absence:
+    """What was believed of one object before nobody saw its place for long enough to have moved it."""
+
+    classes: tuple[Particles | None, ...]
+    """of each class; None where it had no pose, or one that was found to be wrong since"""
+    log_odds: Array
+    """(C,) log of P(moved) / P(stayed) by Equation 3; -inf for what can't be moved"""
+    begin_ns: int
+    end_ns: int
+    """of the first keyframe that had its place in view again"""
 
 
 @dataclass(frozen=True)
@@ -106,6 +122,8 @@ class Belief:
     memory: Memory = field(default_factory=Memory)
     past: Past | None = None
     """for the backward pass; None where nobody goes back"""
+    absence: Absence | None = None
+    """the last one"""
 
     def class_log_evidence(self, model: Model) -> Array:
         """(C,) log evidence of each class at this place, prior included."""
@@ -124,6 +142,17 @@ class _Effort:
     """effort of a fresh search, as a share of the first one's; 0 = none"""
     standard: _Standard | None
     """what the poses that a search finds are held to, beside what is believed"""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """What may have happened to one class of one object since its place was last in view."""
+
+    spread: Spread
+    log_moved: float
+    """log of P(moved) / P(stayed); -inf where the time was too short, or it can't be moved"""
+    supports: tuple[Plane, ...]
+    """level surfaces, world frame, that it may have been moved onto"""
 
 
 @dataclass(frozen=True)
@@ -164,6 +193,10 @@ class Reported:
     """of a keyframe that had its place in view"""
     effective: float = 0.0
     """effective sample size of the most probable class"""
+    moved: float = 0.0
+    """P(it was moved in the last absence, to where it is now | it is there)"""
+    returned_ns: int | None = None
+    """when that absence ended; None where there was none"""
 
     @property
     def best_class(self) -> int:
@@ -294,6 +327,7 @@ class Updater:
         moved = replace(
             belief,
             classes=classes,
+            absence=_still_known(belief.absence, classes),
             score_sum=scores,
             present_ns=belief.present_ns if detection is None else observation.frame.time_ns,
             time_ns=observation.frame.time_ns,
@@ -365,7 +399,19 @@ class Updater:
         chosen = belief.classes[int(np.argmax(probability))]
         elsewhere = float(np.exp(belief.log_elsewhere - np.logaddexp(there, belief.log_elsewhere)))
         effective = 0.0 if chosen is None else chosen.particles.effective
-        said = Reported(probability, there, existence, elsewhere, belief.visible, tuple(modes), effective=effective)
+        best = int(np.argmax(probability))
+        moved = 0.0 if chosen is None else self._moved(belief, self.model.shapes[best], chosen.particles, around)
+        said = Reported(
+            probability,
+            there,
+            existence,
+            elsewhere,
+            belief.visible,
+            tuple(modes),
+            effective=effective,
+            moved=moved,
+            returned_ns=None if belief.absence is None else belief.absence.end_ns,
+        )
         return replace(said, ledger=self._ledger(belief, said, before, around, scores, context))
 
     def _ledger(
@@ -411,6 +457,19 @@ class Updater:
                 lines.append(Line("prediction", float(nats)))
         return tuple(lines)
 
+    def _moved(self, belief: Belief, shape: Shape, particles: Particles, around: Surroundings) -> float:
+        """P(particles came to where they are by a move in the last absence), against having stayed."""
+        gap = belief.absence
+        before = None if gap is None else gap.classes[shape.index]
+        if gap is None or before is None or not np.isfinite(gap.log_odds[shape.index]):
+            return 0.0
+        T = particles.resampled(_ASKED, 0.5)
+        away = float(np.linalg.norm(belief.viewpoint))
+        spread = predicted_spread(self.model, self.localisation, (belief.time_ns - gap.begin_ns) * 1e-9, away)
+        stayed = predicted_log_density(before, T, spread, shape)
+        landed = gap.log_odds[shape.index] + landing_log_density(self.model, shape, T, around.supports)
+        return float(np.exp(landed - np.logaddexp(stayed, landed)).mean())
+
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
         if observation.frame.visit == belief.visit:
@@ -449,7 +508,10 @@ class Updater:
         return camera if own is None else camera - own.particles.best(1)[0, :3, 3]
 
     def _allow_move(self, belief: Belief, observation: Observation) -> Belief:
-        """After a significant absence the object stayed with S(dt) (Equation 3), or is where nobody has looked."""
+        """After a significant absence the object stayed with S(dt) (Equation 3), or was moved.
+
+        What was moved is where nobody has looked, or else a pose of this view, see `_weigh`.
+        """
         gap = (observation.frame.time_ns - belief.time_ns) * 1e-9
         settings = self.model.config.prediction
         if gap < settings.significant_period_s:
@@ -462,7 +524,21 @@ class Updater:
             None if own is None else replace(own, log_evidence=own.log_evidence + float(log_stay[c]))
             for c, own in enumerate(belief.classes)
         )
-        return replace(belief, classes=classes, log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)))
+        with np.errstate(divide="ignore"):
+            log_odds = np.log1p(-stay) - log_stay
+        poses = tuple(None if own is None else own.particles for own in belief.classes)
+        return replace(
+            belief,
+            classes=classes,
+            log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)),
+            absence=Absence(poses, log_odds, belief.time_ns, observation.frame.time_ns),
+        )
+
+    def _moved_odds(self, belief: Belief, shape: Shape, observation: Observation) -> float:
+        """log of P(moved) / P(stayed) of a class, in the keyframe that ends an absence; else -inf."""
+        gap = belief.absence
+        returned = gap is not None and gap.end_ns == observation.frame.time_ns
+        return float(gap.log_odds[shape.index]) if gap is not None and returned else -np.inf
 
     def _counts(self, log_evidence: Array) -> NDArray[np.int64]:
         """Particles a class, by its probability, none fewer than the least."""
@@ -543,8 +619,12 @@ class Updater:
         proposals = self._in_world(modes, observation)
         if effort.search > 0.0 and effort.standard is not None and proposals is not None:
             own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
-        spread = self._spread(observation, belief.time_ns, starts)
-        stepped = self._weigh(own, proposals, shape, view, observation, effort.particles, rng, spread)
+        change = _Change(
+            self._spread(observation, belief.time_ns, starts),
+            self._moved_odds(belief, shape, observation),
+            around.supports,
+        )
+        stepped = self._weigh(own, proposals, shape, view, observation, effort.particles, rng, change)
         if stepped is None or own is belief.classes[shape.index]:
             return stepped
         return replace(stepped, transition=None)  # a pose found late has no past among the particles
@@ -597,7 +677,7 @@ class Updater:
         observation: Observation,
         count: int,
         rng: np.random.Generator,
-        spread: Spread | None = None,
+        change: _Change | None = None,
     ) -> ClassBelief | None:
         """Draw from prediction and proposals, weigh by the model (see `particles`)."""
         log_uniform = self.model.log_uniform(shape)
@@ -608,26 +688,30 @@ class Updater:
         n_proposed = round(share * count)
         drawn = []
         prior = None
-        if own is not None and spread is not None:
+        if own is not None and change is not None:
             # what is hardly possible isn't worth it
             sure = count > settings.min_particles
-            prior = filled(own.particles, spread, shape, rng) if sure else own.particles
-            drawn.append(predict(prior, count - n_proposed, spread, shape, rng))
+            prior = filled(own.particles, change.spread, shape, rng) if sure else own.particles
+            drawn.append(predict(prior, count - n_proposed, change.spread, shape, rng))
         if proposals is not None:
             drawn.append(proposals.draw(n_proposed, shape, rng))
         T = np.concatenate(drawn)
         score, scores = self.proposer.score(shape, view, observation.frame.T_camera_world @ T)
         log_prior = log_drawn = np.full(len(T), log_uniform)
         transition = None
-        if own is not None and prior is not None and spread is not None:
+        if own is not None and prior is not None and change is not None:
             # nobody pushes a cupboard; if it seems to be elsewhere it was never found, which a search can mend
             jump = self.model.config.prediction.jump_probability if shape.source.movable else 0.0
-            stayed = np.log1p(-jump) + predicted_log_density(prior, T, spread, shape)
-            log_drawn = np.logaddexp(stayed, np.log(jump) + log_uniform) if jump > 0.0 else stayed
+            stayed = np.log1p(-jump) + predicted_log_density(prior, T, change.spread, shape)
+            elsewhere = np.full(len(T), np.log(jump) + log_uniform if jump > 0.0 else -np.inf)
+            if np.isfinite(change.log_moved):
+                landed = landing_log_density(self.model, shape, T, change.supports)
+                elsewhere = np.logaddexp(elsewhere, change.log_moved + landed)
+            log_drawn = np.logaddexp(stayed, elsewhere)
             # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
             seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
             log_prior = np.where(seen, log_drawn, stayed)
-            transition = Transition(spread, np.asarray(seen & (jump > 0.0)))
+            transition = Transition(change.spread, np.where(seen, elsewhere, -np.inf))
             # the prediction's tails end somewhere, or thousands of nats of depth buy any distance
             log_prior = np.where(self._nearby(own.particles, T), log_prior, -np.inf)
         log_q = log_drawn
@@ -670,6 +754,17 @@ class Updater:
 
     def _rng(self, stage: str, object_id: int, observation: Observation, shape: Shape) -> np.random.Generator:
         return generator(self.model.config.seed, f"{stage}.{shape.source.obj_id}", object_id, observation.frame.index)
+
+
+def _still_known(absence: Absence | None, classes: Sequence[ClassBelief | None]) -> Absence | None:
+    """An absence without classes whose pose before it has been given up: the one found late was theirs then, too."""
+    if absence is None:
+        return None
+    known = tuple(
+        None if own is None or own.transition is None else before
+        for before, own in zip(absence.classes, classes, strict=True)
+    )
+    return replace(absence, classes=known)
 
 
 def predicted_spread(model: Model, localisation: LocalisationNoise, dt_s: float, away_m: float) -> Spread:

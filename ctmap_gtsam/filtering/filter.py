@@ -28,8 +28,10 @@ from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
+from sequences.geometry import Plane
 from sequences.progress import SILENT, SILENT_STAGE, Progress, Stage, timed
 from sequences.types import Detection, Frame, Run
 
@@ -97,6 +99,8 @@ class Forward:
         """(3,) which way was up by the visits before"""
         self.stood: dict[int, dict[int, Stand]] = {}
         """visit -> object -> how it stood when it was last in view there; of those that surely were there"""
+        self.surfaces: list[tuple[Plane, ...]] = []
+        """level surfaces at each keyframe, as far as they were known"""
         self.scored = Scored()
 
     def step(self, observation: Observation, stage: Stage = SILENT_STAGE) -> None:
@@ -112,6 +116,7 @@ class Forward:
         with timed(stage, "tracks and surfaces"):
             self.associator.step(observation)
             self.place.update(observation)
+            self.surfaces.append(self.place.surfaces)
         before = self.reports[-1] if self.reports else {}
         surroundings = self.surroundings(before)
         tracks = self.associator.tracks()
@@ -222,7 +227,8 @@ class Forward:
         for i, (found, same) in moved.items():
             between = self.beliefs[i].present_ns, self.beliefs[found].first_ns
             self.found_moved.append((i, between, same))
-            self.beliefs[i] = as_moved(self.beliefs[i], self.beliefs.pop(found), self.known[i])
+            old, new = self.beliefs[i], self.beliefs.pop(found)
+            self.beliefs[i] = as_moved(old, new, self.known[i], self.model, self.place.surfaces)
             self.owner |= {track: i for track, owner in self.owner.items() if owner == found}
             for stands in self.stood.values():
                 if found in stands:
@@ -275,7 +281,7 @@ def filtered(run: Run, state: Forward) -> Estimate:
             r.write(tables, rows, i, k, model)
     frames = [run.frames[int(f)] for f in keyframes]
     _write_moves(tables, rows, frames, state)
-    return build_estimate(
+    estimate = build_estimate(
         run,
         model.config,
         "filter-ct" if model.context else "filter-t",
@@ -289,6 +295,7 @@ def filtered(run: Run, state: Forward) -> Estimate:
             **describe(state.place),
         },
     )
+    return with_supports(estimate, model, state.surfaces, settled=True)
 
 
 def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame], state: Forward) -> None:
@@ -303,8 +310,12 @@ def _write_moves(tables: Tables, rows: Mapping[int, int], frames: Sequence[Frame
         for a, b in pairwise(seen):
             if times[b] - times[a] < significant_ns or _within(state.found_moved, i, times[a], times[b]):
                 continue
-            end = max(k for k in seen if frames[k].visit == frames[b].visit)
-            tables.move(row, (a, b), state.reports[end][i].elsewhere, (int(times[a]), int(times[b])))
+            after = [state.reports[k][i] for k in seen if k >= b and frames[k].visit == frames[b].visit]
+            elsewhere = after[-1].elsewhere
+            # nearby: as believed when the visit ends, or the next absence in it begins
+            nearby = [r.moved for r in after if r.returned_ns == times[b]]
+            moved = elsewhere + (1.0 - elsewhere) * (nearby[-1] if nearby else 0.0)
+            tables.move(row, (a, b), moved, (int(times[a]), int(times[b])))
 
 
 def _within(found: Sequence[tuple[int, tuple[int, int], float]], i: int, begin: int, end: int) -> bool:

@@ -1,6 +1,6 @@
 """What the filter believed of an object, keyframe by keyframe: what the backward pass goes back through.
 
-It is kept only where somebody will go back (`ctmap_gtsam.filtering.backward`). A pose takes 28 bytes and a weight 4;
+It is kept only where somebody will go back (`ctmap_gtsam.filtering.backward`). A pose takes 28 bytes and its weights 8;
 classes that sleep at a keyframe keep nothing there. An object with 300 particles and five classes awake takes some
 15 kB a keyframe.
 """
@@ -29,17 +29,18 @@ class Kept:
     """(M,)"""
     spread: Spread | None
     """of the prediction from the poses of this class that were kept last; None: from none of them"""
-    may_jump: NDArray[np.bool_]
-    """(M,) which of them the prior lets come from anywhere nearby"""
+    log_elsewhere: NDArray[np.float32]
+    """(M,) log density of having come from elsewhere, pushed or moved; -inf where that can't be"""
 
     @classmethod
     def of(cls, particles: Particles, transition: Transition | None) -> Kept:
         """What particles are, and how they came from those before."""
         T = particles.T_world_centre
         pose = np.concatenate([se3.quaternion(T[:, :3, :3]), T[:, :3, 3]], axis=-1)
-        nowhere = np.zeros(len(T), dtype=np.bool_)
-        spread, may_jump = (None, nowhere) if transition is None else (transition.spread, transition.may_jump)
-        return cls(pose.astype(np.float32), particles.log_weight.astype(np.float32), spread, may_jump)
+        nowhere = np.full(len(T), -np.inf)
+        spread, elsewhere = (None, nowhere) if transition is None else (transition.spread, transition.log_elsewhere)
+        single = (pose.astype(np.float32), particles.log_weight.astype(np.float32))
+        return cls(*single, spread, elsewhere.astype(np.float32))
 
     def particles(self) -> Particles:
         """Them again."""

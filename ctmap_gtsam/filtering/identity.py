@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ctmap_gtsam.filtering.belief import Belief, Reported
+from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Reported
 from ctmap_gtsam.filtering.history import moved_past
+from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.shapes import one_place_m
+from ctmap_gtsam.shapes import Shape, one_place_m
+from factors.mixture import log_sum, normalised
+from sequences.geometry import Plane
 
 Array = NDArray[np.float64]
 
@@ -83,13 +86,41 @@ def _one_class(gone: Belief, found: Belief, known: Array, found_report: Reported
     return float((known * found_report.class_probability)[movable].sum())
 
 
-def as_moved(old: Belief, found: Belief, known: Array) -> Belief:
-    """The belief of an object at its new place: what was known of its class (C,) is still known."""
+def as_moved(old: Belief, found: Belief, known: Array, model: Model, supports: tuple[Plane, ...]) -> Belief:
+    """The belief of an object at its new place: what was known of its class (C,) is still known.
+
+    And somebody put it there: where level surfaces are known, poses and classes that rest on them are likelier. That
+    says nothing for or against there being a known thing, as what nobody knows rests on them, too.
+
+    Args:
+        old: of the object at its old place.
+        found: what it was met again as.
+        known: what was known of its class (C,) when it last surely was there.
+        model: shapes and settings.
+        supports: level surfaces, world frame.
+    """
     evidence = np.log((1.0 - _MISTAKEN) * len(known) * known + _MISTAKEN)
+    found = replace(found, score_evidence=found.score_evidence + evidence)
+    landed = [
+        None if own is None else _landed(own, model, shape, supports)
+        for shape, own in zip(model.shapes, found.classes, strict=True)
+    ]
+    resting = replace(found, classes=tuple(landed))
+    gained = log_sum(resting.class_log_evidence(model)) - log_sum(found.class_log_evidence(model))
+    classes = tuple(None if c is None else replace(c, log_evidence=c.log_evidence - float(gained)) for c in landed)
     return replace(
         found,
         object_id=old.object_id,
-        score_evidence=found.score_evidence + evidence,
+        classes=classes,
         first_ns=old.first_ns,
         past=moved_past(found.past, old.past),
     )
+
+
+def _landed(own: ClassBelief, model: Model, shape: Shape, supports: tuple[Plane, ...]) -> ClassBelief:
+    """A class that was begun anywhere in the neighbourhood, as one that was put there."""
+    particles = own.particles
+    ratio = landing_log_density(model, shape, particles.T_world_centre, supports) - model.log_uniform(shape)
+    joint = particles.log_weight + ratio
+    weighed = replace(particles, log_weight=normalised(joint))
+    return replace(own, particles=weighed, log_evidence=own.log_evidence + float(log_sum(joint)))

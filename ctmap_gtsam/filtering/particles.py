@@ -81,8 +81,9 @@ class Transition:
     """The prior under which M particles were weighed, given those before them."""
 
     spread: Spread
-    may_jump: NDArray[np.bool_]
-    """(M,) which of them may also come from anywhere nearby"""
+    log_elsewhere: Array
+    """(M,) log density of what did not come from there by the prediction: pushed, or moved in an absence; -inf where
+    that can't be"""
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,10 @@ class Partner:
         (T_a, a), (T_b, b) = pair if self.first else pair[::-1]
         return among_log_ratio(instance_log_ratio(T_a, T_b, self.relation, a, b), self.candidates)
 
+    def concerns(self, own: Shape, other: Shape) -> bool:
+        """Whether two classes are those that are known to have been moved together."""
+        return (own.index, other.index) == self.classes
+
     @property
     def log_peak(self) -> float:
         """The greatest value of `log_ratio`."""

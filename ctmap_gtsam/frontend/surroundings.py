@@ -133,9 +133,10 @@ class Surroundings:
 
     def _partnership(self, shape: Shape, other: Neighbour) -> Partner | None:
         """The partner where it is this neighbour, and both are of the classes that it is known of."""
-        of = other.object_id, (shape.index, other.shape.index)
         own = self.partner
-        return own if own is not None and (own.object_id, own.classes) == of else None
+        if own is None or own.object_id != other.object_id or not own.concerns(shape, other.shape):
+            return None
+        return own
 
     def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
         settings = model.config.context

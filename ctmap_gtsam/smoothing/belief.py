@@ -232,7 +232,8 @@ def judge(
         if not any(len(modes) for s in sightings.values() if (modes := s.modes[c]) is not None):
             continue
         stages[c] = tuple(_stage(sightings[k], c, len(keyframes), recording) for k in keyframes)
-        posteriors[c] = solve(stages[c], model, shape, _noise_variance(stages[c], shape, recording, model))
+        noise = _noise_variance(stages[c], shape, recording, model)
+        posteriors[c] = solve(stages[c], model, shape, noise, recording.place.surfaces)
         evidence[c] = posteriors[c].log_evidence
     scores = _score_evidence(boxes, recording, model)
     clutter = float(sum(s.log_clutter for s in sightings.values()))

@@ -19,11 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import prediction, symmetry
 from factors.mixture import LOG_2PI, log_sum
 from sequences import se3
+from sequences.geometry import Plane
 
 Array = NDArray[np.float64]
 
@@ -65,7 +67,13 @@ class Posterior:
         return bool(self.moved[i - 1] < _STAYED)
 
 
-def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: Array) -> Posterior:
+def solve(
+    stages: Sequence[Stage],
+    model: Model,
+    shape: Shape,
+    noise_variance: Array,
+    supports: tuple[Plane, ...] = (),
+) -> Posterior:
     """Forward-backward and the best path.
 
     Args:
@@ -73,6 +81,7 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
         model: potentials.
         shape: the class.
         noise_variance: (6,) of what moves a mode between two views but isn't the object: localisation's error.
+        supports: level surfaces, world frame, that it may have been moved onto.
     """
     emissions = [_emission(stage, model, shape) for stage in stages]
     first = np.full(len(stages[0].log_evidence), np.log(PRESENT_AT_FIRST) + model.log_uniform(shape))
@@ -80,8 +89,8 @@ def solve(stages: Sequence[Stage], model: Model, shape: Shape, noise_variance: A
     start = np.concatenate([first, [-np.inf, np.log1p(-PRESENT_AT_FIRST)]])
     forward, steps, known = [start + emissions[0]], [], _Known.at_first(stages[0])
     for a, b, emission in zip(stages, stages[1:], emissions[1:], strict=False):
-        between = _Between.of(a, b, model, shape, noise_variance)
-        step = _transition(known, b, between, model, shape)
+        between = _Between.of(a, b, model, shape, noise_variance, supports)
+        step = _transition(known, b, between, shape)
         known = _update(known, b, between, forward[-1], step, shape)
         steps.append(step)
         forward.append(log_sum(forward[-1][:, None] + step.log_total, axis=0) + emission)
@@ -100,8 +109,8 @@ class _Step:
     """(n + 2, m + 2) log probability (density at modes) of each transition"""
     log_stay: Array
     """(n + 1, m + 1) the part of transitions among modes and unmeasured in which the object stayed"""
-    log_appear: float
-    """the other part of each transition to a mode, whatever was before: it came from elsewhere"""
+    log_appear: Array
+    """(m,) the other part of each transition to a mode, whatever was before: it came from elsewhere"""
 
 
 def _emission(stage: Stage, model: Model, shape: Shape) -> Array:
@@ -147,14 +156,22 @@ class _Between:
     sigma: Array
     """(6, 6) of it and of what localisation and the depth's bias add to what is measured"""
 
+    log_elsewhere: Array
+    """(m,) log density of each mode's pose for what came from elsewhere: averaged over the mode's Gaussian"""
+
     @classmethod
-    def of(cls, a: Stage, b: Stage, model: Model, shape: Shape, noise_variance: Array) -> _Between:
+    def of(
+        cls, a: Stage, b: Stage, model: Model, shape: Shape, noise_variance: Array, supports: tuple[Plane, ...]
+    ) -> _Between:
         dt = max(b.time_s - a.time_s, 1e-3)
+        absence = dt > model.config.prediction.significant_period_s
         walk = model.prediction_covariance(dt)
-        return cls(*model.log_transitions(shape.source, dt), walk, walk + np.diag(noise_variance))
+        # a push leaves a thing nearby; what somebody took away is put down somewhere
+        landing = landing_log_density(model, shape, b.T_world_centre, supports if absence else (), b.covariance)
+        return cls(*model.log_transitions(shape.source, dt), walk, walk + np.diag(noise_variance), landing)
 
 
-def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape: Shape) -> _Step:
+def _transition(known: _Known, b: Stage, between: _Between, shape: Shape) -> _Step:
     n, m = len(known.covariance), len(b.log_evidence)
     log_stay = np.full((n, m + 1), between.log_stay)
     if m:
@@ -166,14 +183,14 @@ def _transition(known: _Known, b: Stage, between: _Between, model: Model, shape:
             between.sigma,
             shape.symmetry,
         )
-    # what did not stay is gone or elsewhere nearby, each as likely
-    appear = between.log_leave + model.log_uniform(shape)
+    # what did not stay is gone or elsewhere, each as likely
+    appear = between.log_leave + between.log_elsewhere
     out = np.full((n + 1, m + 2), -np.inf)
     out[:n, : m + 1] = log_stay
     out[:, :m] = np.logaddexp(out[:, :m], appear)
     out[:n, m + 1] = between.log_leave
     out[n, m + 1] = between.log_remain
-    return _Step(out, log_stay, float(appear))
+    return _Step(out, log_stay, appear)
 
 
 def _update(known: _Known, b: Stage, between: _Between, forward: Array, step: _Step, shape: Shape) -> _Known:

@@ -27,6 +27,7 @@ from ctmap_gtsam.frontend.company import Company
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import PoseModes, Proposer
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import one_place_m
@@ -41,6 +42,7 @@ from ctmap_gtsam.smoothing.seeding import Believed, believed, careful, news, rem
 from ctmap_gtsam.smoothing.solver import Solution
 from ctmap_gtsam.smoothing.window import Window
 from ctmap_gtsam.smoothing.writing import Told, note_class, note_graph, write_at
+from sequences.geometry import Plane
 from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
@@ -157,6 +159,8 @@ class _Walk:
         self.company: dict[int, Company] = {}
         """visit -> who was moved together, by the keyframe before"""
         self.window = Window(lag + self.settings.window)
+        self.surfaces: list[tuple[Plane, ...]] = []
+        """at each keyframe"""
         self.tables = Tables(0, n, len(self.model.catalogue))
         self.rows: dict[int, int] = {}
         """object -> row of the tables"""
@@ -178,6 +182,7 @@ class _Walk:
         if k == 0 or self.cameras[-1].visit != self.cameras[-2].visit:
             self.up_before = self.recording.place.up_world
         self.recording.place.update(observation)
+        self.surfaces.append(self.recording.place.surfaces)
         self.recent.append(observation)
         now = {i: b for i, b in believed(self.forward, self.model, k).items() if i not in self.twins}
         self._let_go(now)
@@ -391,7 +396,7 @@ class _Walk:
         }
         if self.solution is not None:
             diagnostics["solver"] = {"end": self.solution.end, "trace": list(self.solution.trace)}
-        return build_estimate(
+        estimate = build_estimate(
             self.recording.run,
             self.model.config,
             method,
@@ -402,6 +407,9 @@ class _Walk:
             self.camera_covariance,
             {"diagnostics": diagnostics, **describe(self.recording.place)},
         )
+        last = len(self.surfaces) - 1
+        said = [self.surfaces[min(k + self.lag, last)] for k in range(len(self.surfaces))]
+        return with_supports(estimate, self.model, said)
 
 
 def _learn(o: _Object, things: Mapping[int, Thing]) -> None:

@@ -12,6 +12,7 @@ from ctmap_gtsam.building import GRAPH_POTENTIALS, Tables, build_estimate
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.frontend.place import describe
 from ctmap_gtsam.frontend.proposer import FLAT_M
+from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
@@ -41,7 +42,7 @@ def write(
         note_class(tables, row, thing)
     rows = {thing.object_id: row for row, thing in enumerate(kept)}
     note_graph(tables, rows, smoothed.contributions, range(len(recording.keyframes)))
-    return build_estimate(
+    estimate = build_estimate(
         recording.run,
         model.config,
         "smooth-ct" if model.context else "smooth-t",
@@ -52,6 +53,7 @@ def write(
         smoothed.camera_covariance,
         {"diagnostics": diagnostics, **describe(recording.place)},
     )
+    return with_supports(estimate, model, [recording.place.surfaces] * len(recording.keyframes))
 
 
 @dataclass(frozen=True)

@@ -87,8 +87,9 @@ def begun(updater, track, observation):
     return updater.start(track, observation, nothing, updater.search(track, observation, nothing))
 
 
-def observation_at(k, detection):
-    frame = frame_of(k, np.eye(4), np.zeros((240, 320), np.float32), [detection], time_s=TIMES[k])
+def observation_at(k, detection, time_s=None):
+    time_s = TIMES[k] if time_s is None else time_s
+    frame = frame_of(k, np.eye(4), np.zeros((240, 320), np.float32), [detection], time_s=time_s)
     return Observation(k, frame, frame.read_depth(), ())
 
 

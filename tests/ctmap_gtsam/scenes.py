@@ -15,6 +15,7 @@ from ctmap_gtsam.shapes import Shape
 from sequences import se3
 from sequences.camera import Camera
 from sequences.catalogue import Catalogue, Mesh
+from sequences.geometry import Plane
 from sequences.rendering.scene import render_scene
 from sequences.simulation.shapes import catalogue, household
 from sequences.types import Detection, Frame, LocalisationNoise, Run, Visit
@@ -56,6 +57,12 @@ def standing(shape: Shape, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> 
     """T_world_centre (4, 4) of a shape upright on the table z = 0."""
     low = shape.mesh.vertices[:, 2].min()
     return se3.make(se3.so3_exp(np.array([0, 0, yaw])), np.array([x, y, -low]))
+
+
+def level(height: float, half: float = 0.6) -> Plane:
+    """A level surface about the z axis, world frame."""
+    hull = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return Plane(UP, height, se3.make(np.eye(3), height * UP), hull, 0.5)
 
 
 def table(half: float = 0.6) -> Mesh:

@@ -92,17 +92,17 @@ def test_where_all_is_gaussian_the_smoother_is_that_of_rauch_tung_and_striebel()
 def kept_cloud(rng, n=7, at=(0.0, 0.0, 0.0), spread=SPREAD, jump=False, sigma=(0.05, 0.005)):
     centre = se3.make(np.eye(3), np.array(at))
     T = se3.retract(centre, rng.normal(size=(n, 6)) * np.repeat(sigma, 3))
-    transition = None if spread is None else Transition(spread, np.full(n, jump))
+    transition = None if spread is None else Transition(spread, np.full(n, -20.0 if jump else -np.inf))
     return Kept.of(Particles(T, mixture.normalised(rng.normal(size=n))), transition)
 
 
 def line_of(kept, picks, may_jump=False):
     T = kept.particles().T_world_centre[picks]
-    return _Line(T, np.full(len(picks), may_jump), np.zeros(len(picks), dtype=bool))
+    return _Line(T, np.full(len(picks), -20.0 if may_jump else -np.inf), np.zeros(len(picks), dtype=bool))
 
 
-def link_of(spread=SPREAD, log_elsewhere=-20.0, joins=False):
-    return _Link(spread, log_elsewhere, joins, np.repeat([0.01, 0.001], 3))
+def link_of(spread=SPREAD, joins=False):
+    return _Link(spread, -20.0 if joins else None, np.repeat([0.01, 0.001], 3))
 
 
 def test_what_is_kept_is_what_was_believed():

@@ -102,7 +102,7 @@ def believed(object_id, evidence):
 def test_what_was_known_of_a_thing_that_seems_to_be_found_again_counts_as_far_as_it_may_be_another(old, found):
     """Ten to one at most against what the new place says, however sure the old one was."""
     gone, there = believed(1, (0.0, 0.0)), believed(2, (found, 0.0))
-    joined = as_moved(gone, there, np.array([old, 1.0 - old]))
+    joined = as_moved(gone, there, np.array([old, 1.0 - old]), MODEL, ())
     assert (joined.object_id, joined.first_ns) == (1, gone.first_ns)
     before, after = (float(np.subtract(*b.class_log_evidence(MODEL))) for b in (there, joined))
     assert abs(after - before) <= np.log(20.0)

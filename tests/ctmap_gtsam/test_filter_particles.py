@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from ctmap_gtsam.filtering.belief import Updater
 from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
 from ctmap_gtsam.frontend.association import Track
+from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from factors import mixture, prediction
@@ -26,7 +27,7 @@ from tests.ctmap_gtsam.gaussian import (
     measurements,
     observation_at,
 )
-from tests.ctmap_gtsam.scenes import classes, config_of, model_of
+from tests.ctmap_gtsam.scenes import classes, config_of, level, model_of
 from tests.factors.strategies import SYMMETRIES, random_image
 
 MUG = model_of("mug").shapes[0]
@@ -172,6 +173,32 @@ def test_a_thing_that_jumped_is_found_as_likely_as_the_prior_says(jump):
     gained = after.classes[0].log_evidence - start.classes[0].log_evidence
     assert gained == pytest.approx(np.log(jump) + model.log_uniform(model.shapes[0]), abs=0.3)
     assert after.classes[0].particles.best(1)[0, 0, 3] == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known surface", "no surface"])
+def test_a_thing_that_was_moved_while_nobody_looked_is_met_as_likely_as_it_lands_there(known):
+    """Equation 3, with the smoother's density of the new place; and it is reported as a move, though in sight."""
+    model = Model(classes("mug"), config_of("prediction.jump_probability=1e-12"), context=False)
+    shape = model.shapes[0]
+    far = se3.make(np.eye(3), REFERENCE[:3, 3] + [0.1, 0.0, 0.0])
+    covariance = {k: np.diag(SCALE**2) for k in (0, 1)}
+    updater = Updater(model, GaussianProposer({0: REFERENCE, 1: far}, covariance), LocalisationNoise())
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    height = float(REFERENCE[2, 3] + shape.hull_points[:, 2].min())
+    around = Surroundings((), (level(height),) if known else ())
+    start = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection))
+    after = updater.step(start, detection, observation_at(1, detection, 12 * 3600.0), around)
+    gained = after.classes[0].log_evidence - start.classes[0].log_evidence
+    moved = np.log(1.0 - model.stay_probability(shape.source, 12 * 3600.0))
+    landing = landing_log_density(model, shape, far[None], around.supports, np.diag(SCALE**2)[None])[0]
+    assert gained == pytest.approx(moved + landing, abs=0.3)
+    assert (landing > model.log_uniform(shape) + 1.0) == known
+    report = updater.report(after, around)
+    assert report.moved > 0.99
+    assert report.returned_ns == round(12 * 3600e9)
+    stayed = Updater(model, GaussianProposer({0: REFERENCE, 1: REFERENCE}, covariance), LocalisationNoise())
+    same = stayed.step(start, detection, observation_at(1, detection, 12 * 3600.0), around)
+    assert stayed.report(same, around).moved < 0.01
 
 
 @pytest.mark.parametrize("jump", [1e-12, 0.01])

@@ -122,7 +122,8 @@ def test_another_class_than_the_one_that_was_there_says_nothing():
     now[M] = replace(now[M], class_index=CAN.index)
     assert company(now, [BEFORE], UP, MODEL) == {}
     partner = company(carried(BEFORE, M, B), [BEFORE], UP, MODEL)[M]
-    assert partner.log_ratio(CAN, now[M].T_world_centre, BOX, now[B].T_world_centre) == 0.0
+    assert partner.concerns(MUG, BOX)
+    assert not partner.concerns(CAN, BOX)
 
 
 @settings(max_examples=15, deadline=None)

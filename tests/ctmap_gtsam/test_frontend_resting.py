@@ -8,17 +8,11 @@ from hypothesis import strategies as st
 from ctmap_gtsam.frontend.resting import UNIFORMS, resting_poses, shifted_poses, snapped_poses
 from sequences import se3
 from sequences.geometry import Plane
-from tests.ctmap_gtsam.scenes import CAMERA, UP, looking, model_of, shape_named, standing
+from tests.ctmap_gtsam.scenes import CAMERA, UP, level, looking, model_of, shape_named, standing
 
 NAMES = ("mug", "cereal_box", "hammer")
 MODEL = model_of(*NAMES)
 FURNITURE = model_of("shelf", "cabinet")
-
-
-def level(height):
-    """A level surface about the origin, world frame."""
-    hull = 0.6 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    return Plane(UP, height, se3.make(np.eye(3), height * UP), hull, 0.5)
 
 
 def wall(yaw):

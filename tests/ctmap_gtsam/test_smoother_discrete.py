@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.discrete import PRESENT_AT_FIRST, Stage, solve
 from factors import mixture, prediction
 from factors.mixture import LOG_2PI
 from factors.persistence import stay_probability
 from sequences import se3
-from tests.ctmap_gtsam.scenes import classes, config_of
+from tests.ctmap_gtsam.scenes import classes, config_of, level
 
 WALKING = ("prediction.rotation_rate=0.2", "prediction.translation_rate=0.05")
 MODEL = Model(classes("mug"), config_of(*WALKING, "smoother.unmeasured=0.0"))
@@ -275,6 +276,18 @@ def test_what_was_known_before_a_move_says_nothing_of_the_new_place():
     apart = solve(before, model, MUG, STILL).log_evidence - there + solve(after, model, MUG, STILL).log_evidence + move
     assert whole.log_evidence == pytest.approx(apart, abs=1e-3)
     assert whole.moved[4] == pytest.approx(1.0)
+
+
+def test_what_was_moved_in_an_absence_landed_and_what_was_pushed_in_view_is_anywhere():
+    """A surface right below the new place changes the evidence by the landing density, after an absence alone."""
+    model = Model(classes("mug"), config_of("smoother.unmeasured=0.0"))
+    surface = (level(float(MUG.hull_points[:, 2].min())),)
+    for gap, lands in ((86400.0, True), (1.0, False)):
+        stages = [at(0, 0.0, 0.0), at(1, 1.0, 0.0), at(2, 1.0 + gap, 0.25), at(3, 2.0 + gap, 0.25)]
+        known, unknown = (solve(stages, model, MUG, STILL, s).log_evidence for s in (surface, ()))
+        landing = landing_log_density(model, MUG, stages[2].T_world_centre, surface, stages[2].covariance)[0]
+        assert landing > model.log_uniform(MUG) + 2.0
+        assert known - unknown == pytest.approx(landing - model.log_uniform(MUG) if lands else 0.0, abs=1e-3)
 
 
 def test_a_view_without_modes_leaves_it_where_it_was():

@@ -118,6 +118,10 @@ def test_a_thing_that_was_moved_between_visits_is_one_object_that_moved():
     assert np.linalg.norm(step[:2] - [0.1, 0.2]) < 0.05
     own = (estimate.moves.object == mug) & (estimate.moves.gap[:, 0] == 3)
     np.testing.assert_allclose(estimate.moves.probability[own], 1.0, atol=0.05)
+    # from the table to the table
+    assert estimate.moves.from_support[own] == estimate.moves.to_support[own]
+    (surface,) = -1 - estimate.moves.to_support[own]
+    assert abs(estimate.meta["surfaces"][surface]["offset_m"]) < 0.01
     other = (estimate.moves.object == 1 - mug) & (estimate.moves.gap[:, 0] == 3)
     assert (estimate.moves.probability[other] < 0.05).all()
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factors import persistence
-from factors.mixture import LOG_ROTATIONS
+from factors.symmetry import Symmetry
+from sequences import se3
 
 MU = st.floats(1.0, 1e7)
 R = st.tuples(st.floats(0.05, 0.6), st.floats(0.0, 0.4))
@@ -39,43 +40,99 @@ def test_short_steps_keep_their_digits():
     assert persistence.move_probability(1e-9, 1e9) == pytest.approx(0.5e-18, rel=1e-9)
 
 
-@given(st.integers(1, 9), st.floats(0.1, 3), st.sampled_from([1, 2, 4]))
+def fibonacci(n):
+    """Directions (n, 3) spread evenly over the sphere."""
+    z = 1.0 - (2.0 * np.arange(n) + 1.0) / n
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(n)
+    return np.stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=-1)
+
+
+def turns_about_z(n):
+    """Motions (n, 4, 4): the n-fold symmetry about z."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    return se3.make(se3.so3_exp(angle[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
+
+
+UPSIDE_DOWN = se3.make(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+AXIS = {"axes": np.array([[0.0, 0.0, 1.0]]), "offsets": np.zeros((1, 3))}
+SYMMETRIES = {
+    "none": Symmetry(),
+    "four-fold": Symmetry(discrete=turns_about_z(4)),
+    "axis": Symmetry(**AXIS),
+    "axis, either end": Symmetry(discrete=np.stack([np.eye(4), UPSIDE_DOWN]), **AXIS),
+    "ball": Symmetry(axes=np.eye(3), offsets=np.zeros((3, 3))),
+}
+SPHERE = fibonacci(20000)
+
+
+def faces(rng, n=4):
+    """What is up on n faces, and the log probabilities of resting on each."""
+    up = rng.normal(size=(n, 3))
+    return up / np.linalg.norm(up, axis=-1, keepdims=True), np.log(rng.dirichlet(np.ones(n)))
+
+
+@pytest.mark.parametrize("name", SYMMETRIES)
+@given(st.integers(0, 2**31), st.floats(0.05, 1.5))
 @settings(max_examples=10)
-def test_the_landing_density_integrates_to_one_over_a_supporter(others, area, order):
-    """Over position and yaw it is uniform; over height and tilt it is a Gaussian; N - 1 supporters share it."""
-    height, tilt = np.linspace(-0.1, 0.1, 61), np.linspace(-0.4, 0.4, 51)
-    h, a, b = np.meshgrid(height, tilt, tilt, indexing="ij")
-    log_density = persistence.move_log_density(
-        others, area, 0.0, h, np.stack([a, b], axis=-1), height_sigma_m=0.01, tilt_sigma_rad=0.05, yaw_order=order
+def test_some_face_is_up_with_certainty(name, seed, sigma):
+    up, log_face = faces(np.random.default_rng(seed))
+    density = persistence.facing_log_density(SPHERE, up, log_face, tilt_sigma_rad=sigma, symmetry=SYMMETRIES[name])
+    assert np.exp(density).mean() * 4.0 * np.pi == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("name", SYMMETRIES)
+@given(st.integers(0, 2**31), st.floats(-3.0, 3.0))
+@settings(max_examples=10)
+def test_which_of_the_poses_that_look_the_same_is_all_the_same(name, seed, angle):
+    symmetry, rng = SYMMETRIES[name], np.random.default_rng(seed)
+    up, log_face = faces(rng)
+    direction = SPHERE[rng.integers(len(SPHERE), size=20)]
+    images = direction @ symmetry.discrete[rng.integers(symmetry.order), :3, :3]
+    if symmetry.free:
+        images = images @ se3.so3_exp(angle * symmetry.free_rotations[:, -1])
+    a, b = (
+        persistence.facing_log_density(u, up, log_face, tilt_sigma_rad=0.3, symmetry=symmetry)
+        for u in (direction, images)
     )
-    cell = (height[1] - height[0]) * (tilt[1] - tilt[0]) ** 2
-    total = np.exp(log_density).sum() * cell * area * (2 * np.pi / order) * others
-    assert total == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-def test_outside_a_supporter_there_is_no_landing_and_free_yaw_has_no_density():
-    at = {"height_sigma_m": 0.01, "tilt_sigma_rad": 0.05}
-    assert persistence.move_log_density(3, np.inf, 0.0, 0.0, np.zeros(2), **at) == -np.inf
-    yaw = persistence.move_log_density(3, 1.0, 0.0, 0.0, np.zeros(2), yaw_order=[1, 0], **at)
-    assert yaw[1] - yaw[0] == pytest.approx(np.log(2 * np.pi))
+def test_an_axis_is_a_symmetry_of_very_many_turns():
+    up, log_face = faces(np.random.default_rng(1))
+    many = Symmetry(discrete=turns_about_z(400))
+    a, b = (
+        persistence.facing_log_density(SPHERE[::50], up, log_face, tilt_sigma_rad=0.2, symmetry=s)
+        for s in (SYMMETRIES["axis"], many)
+    )
+    np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-@given(st.floats(-0.1, 0.1), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_landing_gradients_are_derivatives(height, tilt_x, tilt_y):
-    at = {"height_sigma_m": 0.02, "tilt_sigma_rad": 0.1}
-    tilt, step = np.array([tilt_x, tilt_y]), 1e-5
+@pytest.mark.parametrize("name", SYMMETRIES)
+@given(st.integers(1, 9), st.floats(0.1, 3))
+@settings(max_examples=5)
+def test_the_landing_density_integrates_to_one_over_a_supporter(name, others, area):
+    """Over position and the turn about the vertical it is uniform; N - 1 supporters share it."""
+    symmetry, height = SYMMETRIES[name], np.linspace(-0.1, 0.1, 61)
+    up, log_face = faces(np.random.default_rng(others))
+    facing = persistence.facing_log_density(SPHERE, up, log_face, tilt_sigma_rad=0.3, symmetry=symmetry)
+    log_density = persistence.landing_log_density(
+        others, area, facing[:, None], height, height_sigma_m=0.01, symmetry=symmetry
+    )
+    rotations = np.exp(symmetry.log_quotient_rotations)
+    total = np.exp(log_density).mean(axis=0).sum() * rotations * (height[1] - height[0]) * area * others
+    assert total == pytest.approx(1.0, abs=1e-3)
 
-    def value(h, t):
-        return persistence.move_log_density(2, 0.5, 0.0, h, t, **at)
 
-    by_height, by_tilt = persistence.move_log_density_gradients(height, tilt, **at)
-    assert by_height == pytest.approx((value(height + step, tilt) - value(height - step, tilt)) / (2 * step), abs=1e-4)
-    numerical = [(value(height, tilt + step * e) - value(height, tilt - step * e)) / (2 * step) for e in np.eye(2)]
-    assert by_tilt == pytest.approx(numerical, abs=1e-4)
+def test_the_landing_density_is_the_papers_uniform_supporter_with_what_a_pose_has_beside_its_place():
+    """1/(N-1) . 1/Area . 1/2 pi . p(face) . N(height) . N(tilt)."""
+    up, p, tilt, height = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]), np.array([0.7, 0.3]), 0.02, 0.004
+    direction = np.array([0.0, np.sin(tilt), np.cos(tilt)])
+    facing = persistence.facing_log_density(direction, up, np.log(p), tilt_sigma_rad=0.05)
+    found = persistence.landing_log_density(3, 0.8, facing, height, height_sigma_m=0.01)
+    at_height = np.exp(-0.5 * (height / 0.01) ** 2) / (np.sqrt(2.0 * np.pi) * 0.01)
+    at_tilt = np.exp(-0.5 * (tilt / 0.05) ** 2) / (2.0 * np.pi * 0.05**2)
+    assert np.exp(found) == pytest.approx(0.7 * at_height * at_tilt / (3 * 0.8 * 2.0 * np.pi), rel=1e-4)
 
 
-def test_a_move_without_supports_integrates_to_one():
-    axis = np.linspace(-5, 5, 81)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    density = np.exp(persistence.unsupported_move_log_density(points, sigma_m=0.8) + LOG_ROTATIONS)
-    assert density.sum() * (axis[1] - axis[0]) ** 3 == pytest.approx(1.0, abs=1e-6)
+def test_outside_a_supporter_there_is_no_landing():
+    assert persistence.landing_log_density(3, np.inf, 0.0, 0.0, height_sigma_m=0.01) == -np.inf
