@@ -19,7 +19,8 @@ from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from factors.symmetry import near
+from factors import symmetry
+from factors.motions import retract
 from sequences import se3
 from sequences.rendering.rasteriser import Rasteriser
 from sequences.types import Detection
@@ -254,7 +255,7 @@ class Proposer:
             reach: (2,) rad and metres by which it may be moved.
         """
         drawn = self._refine(shape, view, T_camera_centre[None], self._fine)
-        xi = se3.local(T_camera_centre, drawn[0])
+        xi = symmetry.residual(T_camera_centre, drawn[0])
         within = np.linalg.norm(xi[:3]) <= reach[0] and np.linalg.norm(xi[3:]) <= reach[1]
         poses = np.concatenate([T_camera_centre[None], drawn]) if within else T_camera_centre[None]
         return float(self.score(shape, view, poses)[0].max())
@@ -344,7 +345,7 @@ class Proposer:
         turned = poses[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3))
         noise = rng.normal(size=(len(poses), self.settings.perturbed_poses, 6))
         noise *= np.repeat([0.35, 0.2 * shape.radius_m], 3)
-        around = se3.retract(poses[:, None], noise)
+        around = retract(poses[:, None], noise)
         return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
 
     def _turned(self, shape: Shape, view: View, poses: Array, twins: Array) -> Array:
@@ -357,7 +358,7 @@ class Proposer:
         rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
         kept = rows[: self.settings.max_modes]
         for turned in poses[rows[0]] @ se3.make(twins, np.zeros((len(twins), 3))):
-            there = near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
+            there = symmetry.near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
             if there.any() and rows[int(np.argmax(there))] not in kept:
                 kept.append(rows[int(np.argmax(there))])
         return sorted(kept, key=lambda row: (-score[row], row))
@@ -430,14 +431,7 @@ def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float
         apart: rad and metres within which two poses are one.
         most: so many rows at most.
     """
-    kept: list[int] = []
-    left = np.argsort(-score, kind="stable")
-    while len(left) and len(kept) < most:
-        row, left = int(left[0]), left[1:]
-        kept.append(row)
-        if len(left):
-            left = left[~near(poses[row], poses[left], shape.symmetry, *apart)]
-    return kept
+    return symmetry.distinct(poses, np.argsort(-score, kind="stable"), most, shape.symmetry, *apart)
 
 
 def _large(shape: Shape) -> bool:
@@ -463,7 +457,7 @@ def _worth(shape: Shape, seen_m: float) -> float:
 def _ladder(poses: Array, axes: Array) -> Array:
     """Poses (n, 6, steps, 4, 4) both ways along axes (n, 6 directions, 6), whose unit is a metre at the surface."""
     steps = np.concatenate([_LADDER_M, -_LADDER_M])
-    return se3.retract(poses[:, None, None], axes[:, :, None] * steps[:, None])
+    return retract(poses[:, None, None], axes[:, :, None] * steps[:, None])
 
 
 def _centre_region(box: Array, image_size: tuple[int, int], nearness: float) -> tuple[Array, Array]:
