@@ -326,7 +326,7 @@ def box_log_ratio(
     image_size: tuple[float, float],
     outlier: float = 0.0,
 ) -> Array:
-    """log[(1 - o) l(detected | rendered) / u + o]: heavy-tailed around the rendered edges, against any box of the image.
+    """log[(1 - o) l(detected | rendered) / u + o]: heavy-tailed about the rendered edges, against any box of the image.
 
     Each edge has a Laplace density with standard deviation `sigma_rel` of the rendered box's width (left and right
     edges) or height (top and bottom), at least a pixel. A false alarm's box has two corners anywhere: u = 4 / (W H)^2.
