@@ -53,6 +53,7 @@ _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth 
 _RIPPLE = 2.0  # a width so many times that of the score's first fall is the score's, the first fall a ripple
 _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
 _ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
+_CLOSER, _CLOSER_SHARE = 3, 0.25  # times as many starts as modes are kept, and share of all, that are looked at closely
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -216,6 +217,7 @@ class Proposer:
         """
         if len(starts) == 0:
             return _no_modes()
+        starts = self._promising(shape, view, starts)
         twins = shape.near_symmetries if near_symmetries else np.zeros((0, 3, 3))
         if len(twins):
             starts = np.concatenate([starts, self._turned(shape, view, starts, twins)])
@@ -237,6 +239,17 @@ class Proposer:
         self.hypotheses_scored -= 1
         depth = float(view.share * self.model.kappa * scores.log_ratio[0])
         return depth, float(score[0]) - depth
+
+    def _promising(self, shape: Shape, view: View, starts: Array) -> Array:
+        """Those of starts (n, 4, 4) that are worth a closer look: the best by score that differ from each other.
+
+        A step of the registration takes as long as a score, and most of what a search finds is found several times.
+        """
+        most = max(_CLOSER * self.settings.max_modes, round(_CLOSER_SHARE * len(starts)))
+        if len(starts) <= most:
+            return starts
+        score, _ = self.score(shape, view, starts)
+        return starts[distinct(shape, starts, score, _ONE_POSE, most)]
 
     def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
