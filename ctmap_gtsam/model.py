@@ -17,6 +17,7 @@ from factors.measurement import (
     box_log_ratio,
     class_log_ratio,
     confusion,
+    detected_log_potential,
     persistent_class_log_evidence,
 )
 from factors.persistence import stay_probability
@@ -156,18 +157,14 @@ class Model:
         A mixture: some detected boxes have nothing to do with their objects.
         """
         d = self.config.detector
-        matched = box_log_ratio(detected, rendered, d.box_sigma, image_size)
-        return np.logaddexp(np.log1p(-d.box_outlier) + matched, np.log(d.box_outlier))
+        return box_log_ratio(detected, rendered, d.box_sigma, image_size, d.box_outlier)
 
     def detection(self, visible: Array, box_log_ratios: Array | None) -> Array:
         """log of the detection potential (K,) for visible shares (K,): with its track's box (K,), or missed (None)."""
         d = self.config.detector
-        seen = d.detection_probability * visible
         if box_log_ratios is None:
-            return np.log1p(-seen)
-        # that the track's own box came from elsewhere is as rare for what hides as for what shows
-        with np.errstate(divide="ignore"):
-            return np.logaddexp(np.log(d.box_outlier) + np.log1p(-seen), np.log(seen) + box_log_ratios)
+            return np.log1p(-d.detection_probability * visible)
+        return detected_log_potential(visible, box_log_ratios, d.detection_probability, d.box_outlier)
 
     def class_scores(self, detection: Detection) -> Array:
         """(C,) log p(s | d) / p(s | clutter) of a score vector for each class d that the detector may believe in."""

@@ -14,11 +14,6 @@ _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 @numba.njit(**_KERNEL)
-def _hat(a):
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-
-
-@numba.njit(**_KERNEL)
 def _quaternion(R, q):
     """[x, y, z, w] up to sign into q (4,), by the best conditioned of Shepperd's four formulas."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -148,21 +143,56 @@ def _relative(T_a, T_b, g, work, out):
 
 
 @numba.njit(**_KERNEL)
-def _untwisting(R, free, centre):
-    """The motion (4, 4) about the centre after which R has no part along the free axes (3, f): f = 1 or 3."""
-    out = np.eye(4)
+def _untwisting(R, free, centre, q, out):
+    """The motion about the centre after which R has no part along the free axes (3, f), f = 1 or 3, into `out` (4, 4).
+
+    `q` is (4,) to write into.
+    """
     if free.shape[1] == 3:
-        U = R.T.copy()
+        for i in range(3):
+            for j in range(3):
+                out[i, j] = R[j, i]
     else:
-        axis = free[:, 0].copy()
-        q = np.empty(4)
+        x, y, z = free[0, 0], free[1, 0], free[2, 0]
         _quaternion(R, q)
-        angle = -2.0 * math.atan2((q[:3] * axis).sum(), q[3])
-        W = _hat(axis)
-        U = np.eye(3) + math.sin(angle) * W + (1.0 - math.cos(angle)) * (W @ W)
-    out[:3, :3] = U
-    out[:3, 3] = centre - U @ centre
-    return out
+        angle = -2.0 * math.atan2(q[0] * x + q[1] * y + q[2] * z, q[3])
+        s, k = math.sin(angle), 1.0 - math.cos(angle)
+        out[0, 0], out[0, 1], out[0, 2] = 1.0 - k * (y * y + z * z), k * x * y - s * z, k * x * z + s * y
+        out[1, 0], out[1, 1], out[1, 2] = k * x * y + s * z, 1.0 - k * (x * x + z * z), k * y * z - s * x
+        out[2, 0], out[2, 1], out[2, 2] = k * x * z - s * y, k * y * z + s * x, 1.0 - k * (x * x + y * y)
+    for i in range(3):
+        out[i, 3] = centre[i] - out[i, 0] * centre[0] - out[i, 1] * centre[1] - out[i, 2] * centre[2]
+
+
+@numba.njit(**_KERNEL)
+def _untwist(R, free, centre, q, U, g, work):
+    """g times the motion that `_untwisting` gives, in place. `U` is (4, 4) and `work` (3, 3) to write into."""
+    _untwisting(R, free, centre, q, U)
+    for i in range(3):
+        g[i, 3] += g[i, 0] * U[0, 3] + g[i, 1] * U[1, 3] + g[i, 2] * U[2, 3]
+    _product(g, U, work)
+    g[:3, :3] = work
+
+
+@numba.njit(**_KERNEL)
+def _least_turned(T_a, T_b, discrete, free, work, q, M):
+    """Which discrete symmetry leaves the smallest angle of log(T_a^-1 T_b g), free rotations taken out.
+
+    The angle a of a rotation has cos(a / 2) = |w| of its quaternion, and that of its swing sqrt((q . u)^2 + w^2).
+    """
+    if len(discrete) == 1 or free.shape[1] == 3:
+        return 0
+    best, chosen = -1.0, 0
+    for s in range(len(discrete)):
+        _relative(T_a, T_b, discrete[s], work, M)
+        if free.shape[1] == 0:
+            score = 2.0 + M[0, 0] + M[1, 1] + M[2, 2]  # 4 w^2, and one
+        else:
+            _quaternion(M, q)
+            score = (q[0] * free[0, 0] + q[1] * free[1, 0] + q[2] * free[2, 0]) ** 2 + q[3] ** 2
+        if score > best:
+            best, chosen = score, s
+    return chosen
 
 
 @numba.njit(**_KERNEL)
@@ -180,27 +210,87 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
         images: (n, 4, 4) out, the g.
         chosen: (n,) out, which discrete symmetry.
     """
-    work, q, r, g, M = np.empty((3, 3)), np.empty(4), np.empty(6), np.eye(4), np.eye(4)
+    work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
+    g, M, U = np.eye(4), np.eye(4), np.eye(4)
     for n in range(T_a.shape[0]):
-        best = np.inf
-        for s in range(discrete.shape[0]):
+        first, last, best = 0, discrete.shape[0], np.inf
+        if information.shape[0] == 0:
+            first = _least_turned(T_a[n], T_b[n], discrete, free, work, q, M)
+            last = first + 1
+        for s in range(first, last):
             g[:] = discrete[s]
             _relative(T_a[n], T_b[n], g, work, M)
             if free.shape[1] > 0:
-                g[:] = g @ _untwisting(M[:3, :3].copy(), free, centre)
+                _untwist(M, free, centre, q, U, g, work)
                 _relative(T_a[n], T_b[n], g, work, M)
             _log(M, q, r)
-            if information.shape[0] == 0:
-                length = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
-            else:
+            length = 0.0
+            if information.shape[0] > 0:
                 L = information[n if information.shape[0] > 1 else 0]
-                length = 0.0
                 for i in range(6):
                     for j in range(6):
                         length += r[i] * L[i, j] * r[j]
-            if s == 0 or length < best:
+            if s == first or length < best:
                 best = length
                 residuals[n], images[n], chosen[n] = r, g, s
+
+
+@numba.njit(**_KERNEL)
+def near(T, others, discrete, free, centre, rotation, translation, out):
+    """Whether the shortest log(T^-1 T_b g) of each of n poses turns and moves by less than a limit, into `out` (n,).
+
+    A shift t of a motion is never longer than that of its log, so most pairs need no more than the distance where the
+    symmetries are turns about the origin.
+
+    Args:
+        T: (4, 4).
+        others: (n, 4, 4).
+        discrete: (S, 4, 4).
+        free: (3, f) free axes through the centre.
+        centre: (3,).
+        rotation: rad.
+        translation: metres.
+        out: (n,) bool.
+    """
+    work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
+    g, M, U = np.eye(4), np.eye(4), np.eye(4)
+    turns = not (np.any(discrete[:, :3, 3]) or (free.shape[1] > 0 and np.any(centre)))
+    farthest = translation * (1.0 + 1e-9)
+    for n in range(len(others)):
+        x, y, z = others[n, 0, 3] - T[0, 3], others[n, 1, 3] - T[1, 3], others[n, 2, 3] - T[2, 3]
+        if turns and x * x + y * y + z * z > farthest * farthest:
+            out[n] = False
+            continue
+        g[:] = discrete[_least_turned(T, others[n], discrete, free, work, q, M)]
+        _relative(T, others[n], g, work, M)
+        if free.shape[1] > 0:
+            _untwist(M, free, centre, q, U, g, work)
+            _relative(T, others[n], g, work, M)
+        _log(M, q, r)
+        turned, moved = r[0] ** 2 + r[1] ** 2 + r[2] ** 2, r[3] ** 2 + r[4] ** 2 + r[5] ** 2
+        out[n] = math.sqrt(turned) < rotation and math.sqrt(moved) < translation
+
+
+@numba.njit(**_KERNEL)
+def distinct(poses, order, most, discrete, free, centre, rotation, translation, kept):
+    """Rows of poses (n, 4, 4), in an order (n,), that are `near` none taken before, into `kept` (n,); their number."""
+    left, number = order.copy(), 0
+    rest = len(left)
+    around, there = np.empty(poses.shape), np.empty(len(left), np.bool_)
+    while rest > 0 and number < most:
+        row = left[0]
+        kept[number] = row
+        number += 1
+        for i in range(1, rest):
+            around[i] = poses[left[i]]
+        near(poses[row], around[1:rest], discrete, free, centre, rotation, translation, there[1:rest])
+        remaining = 0
+        for i in range(1, rest):
+            if not there[i]:
+                left[remaining] = left[i]
+                remaining += 1
+        rest = remaining
+    return number
 
 
 @numba.njit(**_KERNEL)

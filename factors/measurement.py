@@ -320,33 +320,46 @@ def _overlap(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def box_log_ratio(
-    box_detected: ArrayLike, box_rendered: ArrayLike, sigma_rel: float, image_size: tuple[float, float]
+    box_detected: ArrayLike,
+    box_rendered: ArrayLike,
+    sigma_rel: float,
+    image_size: tuple[float, float],
+    outlier: float = 0.0,
 ) -> Array:
-    """log[l(detected | rendered) / u]: heavy-tailed around the rendered edges, against any box of the image.
+    """log[(1 - o) l(detected | rendered) / u + o]: heavy-tailed about the rendered edges, against any box of the image.
 
     Each edge has a Laplace density with standard deviation `sigma_rel` of the rendered box's width (left and right
     edges) or height (top and bottom), at least a pixel. A false alarm's box has two corners anywhere: u = 4 / (W H)^2.
 
     Args:
         box_detected: (..., 4) COCO xywh, pixels.
-        box_rendered: (..., 4) box of the rendered pixels that are visible; NaN or one without area gives -inf.
+        box_rendered: (..., 4) box of the rendered pixels that are visible; NaN or one without area has l = 0.
         sigma_rel: of a detector's edges, relative to the box.
         image_size: width, height in pixels.
+        outlier: o, the share of boxes that have nothing to do with their objects.
     """
     found, drawn = np.asarray(box_detected, dtype=np.float64), np.asarray(box_rendered, dtype=np.float64)
     pairs = np.empty((2, *np.broadcast(found, drawn).shape))
     pairs[0], pairs[1] = found, drawn
     out = np.empty(pairs.shape[1:-1])
     log_clutter = math.log(4.0) - 2.0 * math.log(image_size[0] * image_size[1])
-    _box_log_ratios(*pairs.reshape(2, -1, 4), float(sigma_rel), log_clutter, out.reshape(-1))
+    _box_log_ratios(*pairs.reshape(2, -1, 4), float(sigma_rel), log_clutter, float(outlier), out.reshape(-1))
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _box_log_ratios(found, drawn, sigma_rel, log_clutter, out):
+def _log_add(a, b):
+    """The log of exp(a) + exp(b); -inf of two that are."""
+    high, low = max(a, b), min(a, b)
+    return high if low == -np.inf else high + math.log1p(math.exp(low - high))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _box_log_ratios(found, drawn, sigma_rel, log_clutter, outlier, out):
+    log_matched, log_outlier = math.log1p(-outlier), math.log(outlier)
     for n in range(len(out)):
         if not (drawn[n, 2] > 0.0 and drawn[n, 3] > 0.0):
-            out[n] = -np.inf
+            out[n] = log_outlier
             continue
         log_density = 0.0
         for axis in range(2):
@@ -354,7 +367,31 @@ def _box_log_ratios(found, drawn, sigma_rel, log_clutter, out):
             low = abs(found[n, axis] - drawn[n, axis])
             high = abs(found[n, axis] + found[n, 2 + axis] - drawn[n, axis] - drawn[n, 2 + axis])
             log_density += -2.0 * math.log(2.0 * scale) - (low + high) / scale
-        out[n] = log_density - log_clutter
+        out[n] = _log_add(log_matched + log_density - log_clutter, log_outlier)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _detected(visible, fits, p_found, outlier, out):
+    for n in range(len(out)):
+        seen = p_found * visible[n]
+        out[n] = _log_add(math.log(outlier) + math.log1p(-seen), math.log(seen) + fits[n])
+
+
+def detected_log_potential(visible: ArrayLike, fits: ArrayLike, p_found: float, outlier: float) -> Array:
+    """The log of o (1 - p_D v) + p_D v l / u, (K,) nats: of a track's own box in a view.
+
+    That it came from elsewhere is as rare for what hides as for what shows.
+
+    Args:
+        visible: (K,) v, the share of each silhouette that is seen.
+        fits: (K,) log l / u, of `box_log_ratio`.
+        p_found: p_D, how often what is seen whole is found.
+        outlier: o, the share of a track's boxes that have nothing to do with their thing.
+    """
+    shares, ratios = np.ascontiguousarray(visible, np.float64), np.ascontiguousarray(fits, np.float64)
+    out = np.empty(len(shares))
+    _detected(shares, ratios, p_found, outlier, out)
+    return out
 
 
 def class_log_ratio(scores: ArrayLike, class_prior: ArrayLike | None = None, floor: float = 0.05) -> Array:

@@ -23,8 +23,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors._shortest import distinct as compiled_distinct
+from factors._shortest import near as compiled_near
 from factors._shortest import shortest, shortest_jacobians
 from factors.mixture import LOG_2PI, LOG_ROTATIONS
+from factors.motions import filled
 from sequences import se3
 from sequences.catalogue import ObjectClass
 
@@ -164,12 +167,24 @@ def residual(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, informat
 
 
 def near(
-    T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry, rotation_rad: float, translation_m: float
+    T: ArrayLike, others: ArrayLike, symmetry: Symmetry, rotation_rad: float, translation_m: float
 ) -> NDArray[np.bool_]:
-    """Whether poses (..., 4, 4), which broadcast, are one but for less than a turn and a shift: (...)."""
-    r = residual(T_a, T_b, symmetry)
-    turned, moved = np.linalg.norm(r[..., :3], axis=-1), np.linalg.norm(r[..., 3:], axis=-1)
-    return np.asarray((turned < rotation_rad) & (moved < translation_m))
+    """Whether poses (..., 4, 4) are the pose T (4, 4) but for less than a turn and a shift: (...)."""
+    poses = np.ascontiguousarray(others, dtype=np.float64)
+    out = np.empty(poses.shape[:-2], dtype=np.bool_)
+    group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
+    compiled_near(np.ascontiguousarray(T), _flat(poses), *group, rotation_rad, translation_m, out.reshape(-1))
+    return out
+
+
+def distinct(
+    poses: ArrayLike, order: Ints, most: int, symmetry: Symmetry, rotation_rad: float, translation_m: float
+) -> list[int]:
+    """Rows of poses (n, 4, 4), the first `most` in an order (m,) that are not `near` one that was taken before."""
+    T, kept = np.ascontiguousarray(poses, dtype=np.float64), np.empty(len(order), dtype=np.int64)
+    group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
+    number = compiled_distinct(T, order, most, *group, rotation_rad, translation_m, kept)
+    return [int(row) for row in kept[:number]]
 
 
 def residual_jacobians(
@@ -232,11 +247,8 @@ def gauge_residual(T_reference: ArrayLike, T: ArrayLike, symmetry: Symmetry) -> 
 def _pairs(T_a: ArrayLike, T_b: ArrayLike) -> tuple[Array, Array]:
     A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
     if A.shape != B.shape:
-        # copies: a broadcast view has another type for a compiled kernel, or warns
         shape = np.broadcast(A, B).shape
-        filled = np.empty((2, *shape))
-        filled[0], filled[1] = A, B
-        A, B = filled[0], filled[1]
+        A, B = filled(A, shape), filled(B, shape)
     return np.ascontiguousarray(A), np.ascontiguousarray(B)
 
 

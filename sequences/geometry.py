@@ -164,18 +164,34 @@ def _normals(grid: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 def _best_candidate(points: Array, normals: Array, rng: np.random.Generator, search: PlaneSearch) -> NDArray[np.bool_]:
     picks = rng.integers(len(points), size=search.candidates)
-    n = normals[picks]
-    tolerance = search.tolerance_per_m * points[:, 2]
-    distance = np.abs(points @ n.T - (points[picks] * n).sum(-1))
-    near = (distance < tolerance[:, None]) & (normals @ n.T > np.cos(search.normal_tolerance_rad))
-    inliers = near[:, np.argmax(near.sum(0))]
+    tolerance, parallel = search.tolerance_per_m * points[:, 2], float(np.cos(search.normal_tolerance_rad))
+    inliers = _most_supported(points, normals, picks, tolerance, parallel)
     for _ in range(3):
         centre, normal = _least_squares(points[inliers])
         distance = np.abs((points - centre) @ normal)
-        inliers = (distance < tolerance) & (np.abs(normals @ normal) > np.cos(search.normal_tolerance_rad))
+        inliers = (distance < tolerance) & (np.abs(normals @ normal) > parallel)
         if inliers.sum() < 10:
             break
     return np.asarray(inliers)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _most_supported(points, normals, picks, tolerance, parallel):
+    """Which points (n,) lie in the plane of the picked one that most do, within a distance each and a cosine."""
+    near, inliers, most = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_), -1
+    xs, ys, zs = points.T.copy()
+    us, vs, ws = normals.T.copy()
+    for pick in picks:
+        a, b, c = normals[pick]
+        offset, count = a * xs[pick] + b * ys[pick] + c * zs[pick], 0
+        for i in range(len(points)):
+            distance = abs(a * xs[i] + b * ys[i] + c * zs[i] - offset)
+            near[i] = (distance < tolerance[i]) & (a * us[i] + b * vs[i] + c * ws[i] > parallel)
+            count += near[i]
+        if count > most:
+            most = count
+            inliers[:] = near
+    return inliers
 
 
 def _least_squares(points: Array) -> tuple[Array, Array]:

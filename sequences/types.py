@@ -55,7 +55,7 @@ class Frame:
     read_colour: Callable[[], Colour] = field(repr=False, compare=False)
     """-> (height, width, 3) uint8 RGB; mid-grey where the run has no colour images"""
 
-    @property
+    @cached_property
     def T_camera_world(self) -> Array:
         """(4, 4) inverse of T_world_camera."""
         from sequences import se3

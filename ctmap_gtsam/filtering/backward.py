@@ -45,7 +45,7 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from factors import mixture
 from factors.mixture import log_sum
-from sequences import se3
+from factors.motions import retract
 from sequences.progress import SILENT, Progress
 from sequences.seeds import generator
 from sequences.types import LocalisationNoise, Run
@@ -198,7 +198,7 @@ def step_back(
     share = np.zeros(len(earlier.log_weight))
     uniform, normal = rng.random((n, 2)), rng.normal(size=(n, 6))
     # what has no past is carried by the prediction, which is the same forth and back
-    T = se3.retract(line.T_world_centre, link.walked * normal)
+    T = retract(line.T_world_centre, link.walked * normal)
     elsewhere, carried, jumped = np.full(n, -np.inf), line.carried.copy(), np.zeros(n)
     on = np.flatnonzero(~line.carried)
     if link.spread is None:

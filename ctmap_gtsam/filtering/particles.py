@@ -26,6 +26,7 @@ from scipy.special import logsumexp
 from ctmap_gtsam.shapes import Shape
 from factors import mixture, symmetry
 from factors.mixture import LOG_2PI
+from factors.motions import retract
 from sequences import se3
 
 Array = NDArray[np.float64]
@@ -102,7 +103,7 @@ class Gaussians:
         picks = rng.choice(len(self.log_weight), size=count, p=np.exp(self.log_weight))
         roots = np.linalg.cholesky(self.covariance + 1e-14 * np.eye(6))
         steps = (roots[picks] @ rng.normal(size=(count, 6, 1)))[..., 0]
-        return _spin(se3.retract(self.T_world_centre[picks], steps), shape, rng)
+        return _spin(retract(self.T_world_centre[picks], steps), shape, rng)
 
     def log_density(self, T: Array, shape: Shape) -> Array:
         """log q (K,) at poses (K, 4, 4), over poses modulo the object's symmetries."""
@@ -124,7 +125,7 @@ def predict(particles: Particles, n: int, spread: Spread, shape: Shape, rng: np.
     """Draw n poses (n, 4, 4) from the prediction of a weighted set."""
     start = particles.resampled(n, float(rng.random()))
     sigma = np.repeat([spread.rotation_rad, spread.translation_m], 3)
-    return _spin(se3.retract(start, sigma * rng.normal(size=(n, 6))), shape, rng)
+    return _spin(retract(start, sigma * rng.normal(size=(n, 6))), shape, rng)
 
 
 def predicted_log_density(particles: Particles, T: Array, spread: Spread, shape: Shape) -> Array:
@@ -240,9 +241,9 @@ def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Ge
     for mode, widths, deviations, axes in sparse:
         own = mode.rows[picks]
         images = symmetry.nearest_image(mode.T_world_centre, T[own], shape.symmetry)
-        along = (se3.local(mode.T_world_centre, images) / walk) @ axes
+        along = (symmetry.residual(mode.T_world_centre, images) / walk) @ axes
         along = np.sqrt(1.0 - widths**2) * along + widths * deviations * normals[own]
-        T[own] = se3.retract(mode.T_world_centre, (along @ axes.T) * walk)
+        T[own] = retract(mode.T_world_centre, (along @ axes.T) * walk)
     return Particles(T, np.full(n, -np.log(n)))
 
 
@@ -303,7 +304,7 @@ def _moments(T: Array, poses: Array, log_weight: Array, S: symmetry.Symmetry) ->
     r = symmetry.residual(T, poses, S)
     for _ in range(_MEANS):
         step = weights @ r
-        T = se3.retract(T, step)
+        T = retract(T, step)
         r = symmetry.residual(T, poses, S)
         if np.abs(step).max() < _STILL:
             break

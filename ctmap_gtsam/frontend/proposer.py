@@ -19,7 +19,8 @@ from ctmap_gtsam.frontend.scoring import Scores, Tile, coarser, cut_tile, refine
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from factors.symmetry import near
+from factors import symmetry
+from factors.motions import retract
 from sequences import se3
 from sequences.rendering.rasteriser import Rasteriser
 from sequences.types import Detection
@@ -52,6 +53,7 @@ _REST_REACH = 2.0  # a resting pose is that many times its reach from the depth 
 _RIPPLE = 2.0  # a width so many times that of the score's first fall is the score's, the first fall a ripple
 _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
 _ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
+_CLOSER, _CLOSER_SHARE = 3, 0.25  # times as many starts as modes are kept, and share of all, that are looked at closely
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -215,6 +217,7 @@ class Proposer:
         """
         if len(starts) == 0:
             return _no_modes()
+        starts = self._promising(shape, view, starts)
         twins = shape.near_symmetries if near_symmetries else np.zeros((0, 3, 3))
         if len(twins):
             starts = np.concatenate([starts, self._turned(shape, view, starts, twins)])
@@ -237,6 +240,17 @@ class Proposer:
         depth = float(view.share * self.model.kappa * scores.log_ratio[0])
         return depth, float(score[0]) - depth
 
+    def _promising(self, shape: Shape, view: View, starts: Array) -> Array:
+        """Those of starts (n, 4, 4) that are worth a closer look: the best by score that differ from each other.
+
+        A step of the registration takes as long as a score, and most of what a search finds is found several times.
+        """
+        most = max(_CLOSER * self.settings.max_modes, round(_CLOSER_SHARE * len(starts)))
+        if len(starts) <= most:
+            return starts
+        score, _ = self.score(shape, view, starts)
+        return starts[distinct(shape, starts, score, _ONE_POSE, most)]
+
     def witness(self, shape: Shape, view: View, T_camera_centre: Array) -> float:
         """What a view's box, or its absence, says for a known thing at a pose (4, 4) against a look-alike, nats."""
         return float(self._witness(view, self.score(shape, view, T_camera_centre[None])[1])[0])
@@ -254,7 +268,7 @@ class Proposer:
             reach: (2,) rad and metres by which it may be moved.
         """
         drawn = self._refine(shape, view, T_camera_centre[None], self._fine)
-        xi = se3.local(T_camera_centre, drawn[0])
+        xi = symmetry.residual(T_camera_centre, drawn[0])
         within = np.linalg.norm(xi[:3]) <= reach[0] and np.linalg.norm(xi[3:]) <= reach[1]
         poses = np.concatenate([T_camera_centre[None], drawn]) if within else T_camera_centre[None]
         return float(self.score(shape, view, poses)[0].max())
@@ -344,7 +358,7 @@ class Proposer:
         turned = poses[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3))
         noise = rng.normal(size=(len(poses), self.settings.perturbed_poses, 6))
         noise *= np.repeat([0.35, 0.2 * shape.radius_m], 3)
-        around = se3.retract(poses[:, None], noise)
+        around = retract(poses[:, None], noise)
         return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
 
     def _turned(self, shape: Shape, view: View, poses: Array, twins: Array) -> Array:
@@ -357,7 +371,7 @@ class Proposer:
         rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
         kept = rows[: self.settings.max_modes]
         for turned in poses[rows[0]] @ se3.make(twins, np.zeros((len(twins), 3))):
-            there = near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
+            there = symmetry.near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
             if there.any() and rows[int(np.argmax(there))] not in kept:
                 kept.append(rows[int(np.argmax(there))])
         return sorted(kept, key=lambda row: (-score[row], row))
@@ -430,14 +444,7 @@ def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float
         apart: rad and metres within which two poses are one.
         most: so many rows at most.
     """
-    kept: list[int] = []
-    left = np.argsort(-score, kind="stable")
-    while len(left) and len(kept) < most:
-        row, left = int(left[0]), left[1:]
-        kept.append(row)
-        if len(left):
-            left = left[~near(poses[row], poses[left], shape.symmetry, *apart)]
-    return kept
+    return symmetry.distinct(poses, np.argsort(-score, kind="stable"), most, shape.symmetry, *apart)
 
 
 def _large(shape: Shape) -> bool:
@@ -463,7 +470,7 @@ def _worth(shape: Shape, seen_m: float) -> float:
 def _ladder(poses: Array, axes: Array) -> Array:
     """Poses (n, 6, steps, 4, 4) both ways along axes (n, 6 directions, 6), whose unit is a metre at the surface."""
     steps = np.concatenate([_LADDER_M, -_LADDER_M])
-    return se3.retract(poses[:, None, None], axes[:, :, None] * steps[:, None])
+    return retract(poses[:, None, None], axes[:, :, None] * steps[:, None])
 
 
 def _centre_region(box: Array, image_size: tuple[int, int], nearness: float) -> tuple[Array, Array]:

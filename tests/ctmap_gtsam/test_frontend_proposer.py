@@ -154,6 +154,26 @@ def test_no_mode_scores_less_than_its_start():
     np.testing.assert_allclose(proposer.model.kappa * scores.log_ratio, modes.depth_log_ratio)
 
 
+def test_the_same_starts_many_times_and_in_any_order_are_the_same_starts():
+    proposer, shape, view, _, T = scene("mug")
+    rng = np.random.default_rng(4)
+    starts = se3.retract(
+        T, rng.uniform(0.5, 1.0, size=(6, 6)) * rng.choice([-1, 1], size=(6, 6)) * ([0.5] * 3 + [0.04] * 3)
+    )
+    many = rng.permutation(np.repeat(starts, 20, axis=0))
+    once, often = (proposer.modes(shape, view, some, probe=False) for some in (starts, many))
+    np.testing.assert_array_equal(once.T_camera_centre, often.T_camera_centre)
+    np.testing.assert_array_equal(once.log_likelihood, often.log_likelihood)
+
+
+def test_of_many_starts_the_best_is_looked_at_closely():
+    proposer, shape, view, _, T = scene("mug")
+    far = se3.retract(T, np.random.default_rng(5).normal(size=(200, 6)) * np.repeat([1.5, 0.03], 3))
+    alone = proposer.modes(shape, view, T[None], probe=False)
+    modes = proposer.modes(shape, view, np.concatenate([far, T[None]]), probe=False)
+    assert modes.log_likelihood[0] >= alone.log_likelihood[0]
+
+
 def bare_cylinder():
     """A model of a smooth cylinder that the catalogue takes for a thing without symmetry."""
     made = trimesh.creation.cylinder(0.035, 0.11, sections=72)

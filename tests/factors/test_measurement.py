@@ -121,6 +121,28 @@ def test_empty_boxes_overlap_nothing():
     assert measurement.box_log_ratio(box, nothing, 0.05, (640, 480)) == -np.inf
 
 
+@given(SEEDS, st.sampled_from([0.0, 0.02, 0.3]))
+def test_outliers_bound_what_a_box_says_against_a_thing(seed, outlier):
+    rng = np.random.default_rng(seed)
+    found, drawn = rng.uniform(1.0, 100.0, size=(2, 20, 4))
+    drawn[:3, 2] = [0.0, -1.0, np.nan]
+    matched = measurement.box_log_ratio(found, drawn, 0.05, (640, 480))
+    with np.errstate(divide="ignore"):
+        mixed = np.logaddexp(np.log1p(-outlier) + matched, np.log(outlier))
+    np.testing.assert_allclose(measurement.box_log_ratio(found, drawn, 0.05, (640, 480), outlier), mixed, atol=1e-12)
+
+
+@given(SEEDS, st.floats(0.01, 0.999), st.floats(1e-6, 0.5))
+def test_a_tracks_box_is_its_things_or_has_nothing_to_do_with_it(seed, found, outlier):
+    rng = np.random.default_rng(seed)
+    visible, fits = np.r_[0.0, 1.0, rng.random(20)], np.r_[rng.normal(0.0, 20.0, size=21), -np.inf]
+    with np.errstate(divide="ignore"):
+        said = np.log(outlier * (1.0 - found * visible) + found * visible * np.exp(fits))
+    np.testing.assert_allclose(
+        measurement.detected_log_potential(visible, fits, found, outlier), said, rtol=1e-12, atol=1e-12
+    )
+
+
 def test_the_box_density_integrates_to_one_an_edge():
     """Along one edge: the density of a box whose left edge moves, times that of the three that stay."""
     drawn, image = np.array([100.0, 80, 60, 40]), (640, 480)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sequences import se3
 from sequences.camera import Camera
-from sequences.geometry import Plane, find_planes, plane_depth, up_from_planes
+from sequences.geometry import Plane, _most_supported, find_planes, plane_depth, up_from_planes
 from sequences.rendering.scene import render_scene
 from tests.tiny import box_mesh
 
@@ -176,3 +176,16 @@ def test_an_image_without_depth_has_no_planes():
 def test_clutter_alone_makes_no_plane():
     depth = np.random.default_rng(0).uniform(0.5, 3.0, (240, 320)).astype(np.float32)
     assert find_planes(CAMERA, depth, np.random.default_rng(0)) == ()
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**31))
+def test_the_plane_is_that_of_the_candidate_which_most_points_support(seed):
+    rng = np.random.default_rng(seed)
+    points, normals = rng.uniform(-1.0, 1.0, size=(200, 3)), rng.normal(size=(200, 3)) * [0.1, 0.1, 1.0]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    picks, tolerance = rng.integers(200, size=12), rng.uniform(0.01, 0.3, size=200)
+    away = np.abs(((points[:, None] - points[picks]) * normals[picks]).sum(axis=-1))
+    near = (away < tolerance[:, None]) & (normals @ normals[picks].T > 0.97)
+    found = _most_supported(points, normals, picks, tolerance, 0.97)
+    np.testing.assert_array_equal(found, near[:, np.argmax(near.sum(axis=0))])
