@@ -170,10 +170,10 @@ def near(
     T: ArrayLike, others: ArrayLike, symmetry: Symmetry, rotation_rad: float, translation_m: float
 ) -> NDArray[np.bool_]:
     """Whether poses (..., 4, 4) are the pose T (4, 4) but for less than a turn and a shift: (...)."""
-    poses = np.ascontiguousarray(others, dtype=np.float64)
+    pose, poses = np.ascontiguousarray(T, np.float64).reshape(4, 4), np.ascontiguousarray(others, np.float64)
     out = np.empty(poses.shape[:-2], dtype=np.bool_)
     group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
-    compiled_near(np.ascontiguousarray(T), _flat(poses), *group, rotation_rad, translation_m, out.reshape(-1))
+    compiled_near(pose, _flat(poses), *group, rotation_rad, translation_m, out.reshape(-1))
     return out
 
 

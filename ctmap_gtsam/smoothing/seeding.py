@@ -234,7 +234,7 @@ def news(model: Model, known: Mapping[int, Array], poses: Mapping[int, Array]) -
         if there is None or not len(there):
             out[c] = some
             continue
-        fresh = [T for T in some if not near(there, T, model.shapes[c].symmetry, *_ONE_POSE).any()]
+        fresh = [T for T in some if not near(T, there, model.shapes[c].symmetry, *_ONE_POSE).any()]
         if fresh:
             out[c] = np.stack(fresh)
     return out
