@@ -189,7 +189,7 @@ class SmootherGraph:
             if label.kind == "measurement":
                 begun[own[-1]] = min(own[0].index, begun.get(own[-1], own[0].index))
         keyframes = [max(begun.get(v, 0) if v.kind == "b" else v.index for v in own) for own in variables]
-        objects = [[*dict.fromkeys(v.row for v in own if v.row is not None), -1, -1] for own in variables]
+        objects = [[*sorted({v.row for v in own if v.row is not None}), -1, -1] for own in variables]
         return Contributions(
             kind=tuple(label.kind for label in labels),
             object=np.array([those[0] for those in objects], dtype=np.int64),

@@ -192,7 +192,7 @@ class _Walk:
         for i in sorted(new):
             self.objects[i].poses = remembered(self.model, {}, now[i].poses)
             self._see_recent(i, now[i], {})
-        around = Surroundings(neighbours_of(before, k, self.model), self.recording.place.surfaces)
+        around = self._around(k, before)
         changed = {i for i in now if i not in new and self._see(i, observation, now[i], around.without(i))}
         self._judge(changed | new)
         self._merge()
@@ -263,10 +263,10 @@ class _Walk:
             o.looks[k], o.sightings[k] = at, sight(at, self.proposer, wish)
         return at is not None or bool(fresh)
 
-    def _around(self, i: int, keyframe: int, there: Mapping[int, Thing]) -> Surroundings:
+    def _around(self, keyframe: int, there: Mapping[int, Thing]) -> Surroundings:
         neighbours = neighbours_of(there, keyframe, self.model)
         company = self.company.get(self.cameras[keyframe].visit, {})
-        return Surroundings(neighbours, self.recording.place.surfaces, company).without(i)
+        return Surroundings(neighbours, self.recording.place.surfaces, company)
 
     def _wish(self, i: int, keyframe: int, b: Believed) -> Wanted:
         """What the filter believes in at a keyframe, and what the smoother does."""
@@ -297,7 +297,7 @@ class _Walk:
         for observation in self.recent:
             k = observation.keyframe
             wish = self._wish_at_first(o, k, b, known)
-            around = self._around(i, k, there)
+            around = self._around(k, there).without(i)
             at = look(observation, self.recording.time_s(k), self.proposer, wish, o.boxes.get(k), around, last)
             if at is not None:
                 o.looks[k], o.sightings[k] = at, sight(at, self.proposer, wish)

@@ -121,9 +121,14 @@ def test_another_class_than_the_one_that_was_there_says_nothing():
     now = carried(BEFORE, M, B)
     now[M] = replace(now[M], class_index=CAN.index)
     assert company(now, [BEFORE], UP, MODEL) == {}
-    partner = company(carried(BEFORE, M, B), [BEFORE], UP, MODEL)[M]
-    assert partner.concerns(MUG, BOX)
-    assert not partner.concerns(CAN, BOX)
+    together = carried(BEFORE, M, B)
+    there = (Neighbour(B, BOX, together[B].T_world_centre, 0.0),)
+    around = Surroundings(there, (), company(together, [BEFORE], UP, MODEL)).without(M)
+    at = together[M].T_world_centre
+    assert set(around.relations(MODEL, MUG, at)) == {B}
+    assert around.relations(MODEL, CAN, at) == {}
+    alone = Surroundings(there, ())
+    np.testing.assert_array_equal(*(x.log_potential(MODEL, CAN, at[None]) for x in (around, alone)))
 
 
 @settings(max_examples=15, deadline=None)
@@ -269,3 +274,10 @@ def test_the_graph_has_the_context_that_the_filter_weighs_with():
     peak = context_log_ratio(1.0, pair, relation.relation.log_peak)
     # three of six keyframes
     assert said_there == pytest.approx(0.5 * (peak - said(M, now, [BEFORE])), abs=1e-9)
+    # the ledger has it of the lower object of the two, whichever the relation is from
+    assert not relation.first
+    lines, own = built.contributions(built.initial), np.array(built.contributions(built.initial).kind) == "context"
+    assert set(zip(lines.object[own], lines.other[own], strict=True)) == {(M, B)}
+    beside = Surroundings((Neighbour(B, BOX, now[B].T_world_centre, 0.0),), (), partners[1]).without(M)
+    told = beside.relations(MODEL, MUG, now[M].T_world_centre)[B]
+    np.testing.assert_allclose(lines.nats[own], told / 6.0, atol=1e-9)

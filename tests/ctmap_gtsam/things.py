@@ -22,6 +22,7 @@ RECORDING = SimpleNamespace(
     run=SimpleNamespace(
         frames=[SimpleNamespace(visit=k // 4) for k in range(8)], localisation=LocalisationNoise(1e-4, 1e-4)
     ),
+    place=SimpleNamespace(surfaces=()),
     T_world_camera=lambda k: np.eye(4),
     time_s=lambda k: (k // 4) * DAY + k,
 )
