@@ -40,10 +40,22 @@ POSES = (
     "mspd_recall",
     "vsd_recall",
     "bop_recall",
+    "mssd_mm_early",
+    "mssd_mm_occlusion",
+    "mssd_mm_reentry",
+    "mssd_mm_steady",
 )
 """Metrics that need poses. posed_share: how many object-frames have a pose of the true class. pose_*: how many are
 within both thresholds. *_auc: area under the curve of accuracy over the threshold, up to AUC_M (Xiang et al., PoseCNN,
-RSS 2018). *_recall: BOP's average recalls (Hodan et al., BOP Challenge 2020, ECCV Workshops 2020), and their mean"""
+RSS 2018). *_recall: BOP's average recalls (Hodan et al., BOP Challenge 2020, ECCV Workshops 2020), and their mean.
+mssd_mm_<situation>: median of the object-frames in a situation that have a pose of the true class, see SITUATIONS"""
+
+SITUATIONS = ("early", "occlusion", "reentry", "steady")
+"""Where hindsight may help: an object's first FRESH frames in which it is visible, the first in each later visit, the
+first after it was out of sight for at least HIDDEN frames of a visit; and all others"""
+
+FRESH = 5
+HIDDEN = 3
 
 AUC_M = 0.1
 """Where PoseCNN's curves end"""
@@ -66,6 +78,8 @@ class FrameErrors:
 
     late: Bools
     """in the second half of the run's frames"""
+    situation: Ints
+    """position in SITUATIONS"""
     class_id: Ints
     """what the method says, -1 where it says nothing"""
     class_correct: Bools
@@ -121,6 +135,7 @@ def frame_errors(
     beliefs = [detection.belief(method, int(row), truth.class_id[n]) for n, row in enumerate(matching.row)]
     return FrameErrors(
         late=_late(truth),
+        situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
         class_id=said,
         class_correct=detection.class_correct(truth, method.objects, matching),
         class_probability=np.array([b.probability for b in beliefs]).reshape(truth.visible.shape),
@@ -150,11 +165,12 @@ def _recall(error: Array) -> Array:
     return np.where(np.isnan(error), np.nan, (error[..., None] < SHARES).mean(axis=-1))
 
 
-def detector_errors(score: detection.DetectorScore, truth: ObjectFrames) -> FrameErrors:
+def detector_errors(run: Run, score: detection.DetectorScore, truth: ObjectFrames) -> FrameErrors:
     """(N, F) the same of the detector's boxes, which have classes and no poses."""
     nothing = np.where(truth.visible, np.inf, np.nan)
     return FrameErrors(
         late=_late(truth),
+        situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
         class_id=score.class_id,
         class_correct=(score.class_id == truth.class_id) & truth.present,
         class_probability=score.class_probability,
@@ -189,7 +205,41 @@ def pose_metrics(errors: FrameErrors) -> dict[str, float | None]:
         "adds_auc": area_under_curve(errors.adds_m),
         **recalls,
         "bop_recall": None if None in recalls.values() else float(np.mean([*recalls.values()])),
+        **{f"mssd_mm_{name}": _posed_mssd(errors, k) for k, name in enumerate(SITUATIONS)},
     }
+
+
+def situations(visible: Bools, visit: Ints) -> Ints:
+    """Which of SITUATIONS each object-frame is in.
+
+    Args:
+        visible: (N, F) true objects in frames.
+        visit: (F,) of each frame, ascending.
+
+    Returns:
+        (N, F); that of object-frames which aren't visible means nothing.
+    """
+    early, occlusion, reentry, steady = range(len(SITUATIONS))
+    out = np.full(visible.shape, steady, dtype=np.int64)
+    for n, seen in enumerate(visible):
+        since, situation, last = FRESH, early, -1
+        for f in np.flatnonzero(seen):
+            if last < 0:
+                since = 0
+            elif visit[f] != visit[last]:
+                since, situation = 0, reentry
+            elif f - last > HIDDEN:
+                since, situation = 0, occlusion
+            if since < FRESH:
+                out[n, f] = situation
+            since, last = since + 1, int(f)
+    return out
+
+
+def _posed_mssd(errors: FrameErrors, situation: int) -> float | None:
+    """Median, millimetres; of what has no pose the other metrics tell."""
+    asked = errors.mssd_m[errors.situation == situation]
+    return median(1e3 * asked[np.isfinite(asked)])
 
 
 def accuracy(translation_m: Array, rotation_rad: Array, within_m: Array, within_rad: Array) -> Array:

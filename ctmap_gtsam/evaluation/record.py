@@ -45,7 +45,7 @@ from sequences.types import Run, Truth
 
 Array = NDArray[np.float64]
 
-SCHEMA = 2
+SCHEMA = 3
 
 DETECTOR = "detector"
 """Name of the method that is the recorded boxes, which have no poses"""
@@ -208,7 +208,7 @@ class Judge:
     def detector(self) -> Judgement:
         """Judge the recorded boxes, each as its best class with that class's score."""
         score = score_detections(self.run, self.objects, self.boxes)
-        errors = frames.detector_errors(score, self.objects)
+        errors = frames.detector_errors(self.run, score, self.objects)
         boxes = judge_boxes(self.boxes, best_classes(self.run), self.run.catalogue.obj_ids)
         record = self._record(
             DETECTOR,

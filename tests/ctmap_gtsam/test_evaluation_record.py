@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from ctmap_gtsam.estimate import Estimate, Moves
 from ctmap_gtsam.evaluation import Record, compare, pooled, pose_curve, record, truth_estimate
 from ctmap_gtsam.evaluation.calibration import denser_mass, nees, spread_about
+from ctmap_gtsam.evaluation.frames import FRESH, HIDDEN, SITUATIONS, situations
 from ctmap_gtsam.evaluation.identity import identity_switches
 from ctmap_gtsam.evaluation.matching import ObjectFrames, shapes_of
 from ctmap_gtsam.evaluation.record import METRICS
@@ -290,6 +291,34 @@ def test_recorded_motion_carries_the_cameras_between_keyframes(small):
     run, truth = small
     sparse = synthetic.estimate_of(run, truth, keyframes=[0, 3, FRAMES])
     assert judged(run, truth, sparse)["ate_mm"] == pytest.approx(0, abs=1e-9)
+
+
+# --- situations ---
+
+
+@given(st.lists(st.lists(st.booleans(), min_size=1, max_size=12), min_size=1, max_size=4))
+def test_a_frame_is_fresh_after_a_beginning_a_visit_or_a_time_out_of_sight(visits):
+    seen = np.array([s for some in visits for s in some])
+    visit = np.concatenate([np.full(len(some), v) for v, some in enumerate(visits)])
+    found = [SITUATIONS[k] for k in situations(seen[None], visit)[0]]
+    for f, (kind, age) in zip(np.flatnonzero(seen), _spans(seen, visit), strict=True):
+        assert found[f] == (kind if age < FRESH else "steady")
+
+
+def _spans(seen, visit):
+    """Of each visible frame: what made it fresh last, and how many visible frames ago."""
+    out, last = [], None
+    for f in np.flatnonzero(seen):
+        if last is None:
+            out.append(("early", 0))
+        elif visit[f] != visit[last]:
+            out.append(("reentry", 0))
+        elif f - last - 1 >= HIDDEN:
+            out.append(("occlusion", 0))
+        else:
+            out.append((out[-1][0], out[-1][1] + 1))
+        last = f
+    return out
 
 
 # --- moves ---
