@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,14 @@ class Told:
     model: Model
     things: Mapping[int, Thing]
     exchanges: Exchanges
+    _leads: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False, compare=False)
+
+    def leads(self, thing: Thing, visit: int, own: Array) -> Array:
+        """`alternatives.leads` of an object in a visit, worked out once, with the first of its poses that is asked."""
+        key = thing.object_id, visit
+        if key not in self._leads:
+            self._leads[key] = leads(thing, visit, own, self.recording, self.model)
+        return self._leads[key]
 
 
 def write_at(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
@@ -123,7 +131,7 @@ def _belief(thing: Thing, k: int, own: Mode, told: Told) -> Iterator[Mode]:
     others = [mode for mode in seen if not own.says_the_same(mode, model.shapes[c])]
     own = replace(own, share=max(1.0 - sum(mode.share for mode in others), _LEAST))
     visit = recording.run.frames[int(recording.keyframes[thing.keyframes[held.view]])].visit
-    lead = leads(thing, visit, own.T_world_centre, recording, model)
+    lead = told.leads(thing, visit, own.T_world_centre)
     own, turned = ways_round(own, others, model.shapes[c], lead, model.config.smoother.surface_nats)
     visit = recording.run.frames[int(recording.keyframes[k])].visit
     shares = told.exchanges.at(thing.object_id, visit)
