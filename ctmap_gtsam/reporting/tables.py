@@ -68,7 +68,7 @@ MORE_COLUMNS = (
     Column("identity_switches", "switches", "", "d", "low", "true objects that become another object of the map"),
     Column("moves_recall", "moves", "%", ".0f", "high", "share of the moves between visits that were found", 100),
     Column("moves_recall_seen", "seen", "%", ".0f", "high",
-           "of these, those that can be seen: not where alike things took each other's places", 100),
+           "the same of the moves that can be seen: not of alike things that took each other's places", 100),
     Column("false_moves", "false moves", "", "d", "low", "moves claimed of what stayed"),
     Column("coverage_95", "coverage", "%", ".0f", "", "share of true poses in the regions that should hold 95 %", 100),
     Column("class_log_score", "log score", "nats", ".2f", "low", "-log P of the true class; mean"),
