@@ -71,9 +71,9 @@ class Partner:
         (T_a, a), (T_b, b) = pair if self.first else pair[::-1]
         return among_log_ratio(instance_log_ratio(T_a, T_b, self.relation, a, b), self.candidates)
 
-    def concerns(self, own: Shape, other: Shape) -> bool:
-        """Whether two classes are those that are known to have been moved together."""
-        return (own.index, other.index) == self.classes
+    def concerns(self, object_id: int, classes: tuple[int, int]) -> bool:
+        """Whether the partner is this neighbour, and it and the object are of the classes that the relation is of."""
+        return (object_id, classes) == (self.object_id, self.classes)
 
     @property
     def log_peak(self) -> float:

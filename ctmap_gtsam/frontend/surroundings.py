@@ -134,9 +134,7 @@ class Surroundings:
     def _partnership(self, shape: Shape, other: Neighbour) -> Partner | None:
         """The partner where it is this neighbour, and both are of the classes that it is known of."""
         own = self.partner
-        if own is None or own.object_id != other.object_id or not own.concerns(shape, other.shape):
-            return None
-        return own
+        return own if own is not None and own.concerns(other.object_id, (shape.index, other.shape.index)) else None
 
     def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
         settings = model.config.context

@@ -200,10 +200,7 @@ class SmootherGraph:
 
     def energy(self, values: Any) -> dict[str, float]:
         """Error by kind at given values, nats."""
-        out: dict[str, float] = {}
-        for label, error in zip(self.labels, self.errors(values).tolist(), strict=True):
-            out[label.kind] = out.get(label.kind, 0.0) + error
-        return out
+        return self.contributions(values).energy
 
 
 @dataclass(frozen=True)
@@ -235,6 +232,14 @@ class Contributions:
     """(n,) the other object of a pair, else -1"""
     nats: Array
     """(n,) log potential relative to its greatest value: minus the factor's error"""
+
+    @property
+    def energy(self) -> dict[str, float]:
+        """The factors' errors by kind, nats."""
+        out: dict[str, float] = {}
+        for kind, nats in zip(self.kind, self.nats.tolist(), strict=True):
+            out[kind] = out.get(kind, 0.0) - nats
+        return out
 
 
 @dataclass(frozen=True)
@@ -533,7 +538,7 @@ def _add_context(
 def _partner(company: Company, a: int, b: int, classes: tuple[int, int]) -> Partner | None:
     """What is known of a pair that was moved together, of these classes."""
     partner = company.get(a)
-    return partner if partner is not None and (partner.object_id, partner.classes) == (b, classes) else None
+    return partner if partner is not None and partner.concerns(b, classes) else None
 
 
 def _add_partners(

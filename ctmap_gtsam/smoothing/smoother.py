@@ -227,10 +227,9 @@ def _solve(
     built, objects = _graph(recording, model, things, company)
     smoothed = smooth(built, model, objects, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
-    energy = built.energy(smoothed.solution.values)
     # the arrays are all that anybody needs from here on, and GTSAM's values can't be kept
     smoothed = replace(smoothed, solution=replace(smoothed.solution, values=None))
-    return Map(things, smoothed, energy, built.count(), company)
+    return Map(things, smoothed, smoothed.contributions.energy, built.count(), company)
 
 
 def _graph(

@@ -17,7 +17,7 @@ from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.alternatives import Exchanges, Mode, elsewhere, exchanges, leads, ways_round
-from ctmap_gtsam.smoothing.belief import Thing
+from ctmap_gtsam.smoothing.belief import Held, Thing
 from ctmap_gtsam.smoothing.discrete import Stage
 from ctmap_gtsam.smoothing.graph import Contributions, Smoothed
 from ctmap_gtsam.smoothing.modes import Recording
@@ -94,13 +94,14 @@ def write_at(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world
 
 
 def _write_pose(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
-    own = _reported(thing, k, told)
-    if own is None:
+    held = thing.held(k)
+    if held is None:
         return
+    own = _mode(thing, held, told)
     recording, model, c = told.recording, told.model, thing.reported_class
     shape = model.shapes[c]
     tables.in_view[row, k] = _share_in_view(shape, own.T_world_centre, T_world_camera, recording, k) > 0.0
-    for mode in _belief(thing, k, own, told):
+    for mode in _belief(thing, k, held, own, told):
         if mode.share >= _REPORTED or mode.T_world_centre is own.T_world_centre:
             _write_mode(tables, row, k, shape, mode)
     for other_class in thing.posteriors:
@@ -108,11 +109,8 @@ def _write_pose(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_wo
             _write_class(tables, row, k, thing, other_class, recording, model)
 
 
-def _reported(thing: Thing, k: int, told: Told) -> Mode | None:
-    """The reported pose, which all of the belief is in at first; None where it has none."""
-    held = thing.held(k)
-    if held is None:
-        return None
+def _mode(thing: Thing, held: Held, told: Told) -> Mode:
+    """The reported pose, which all of the belief is in at first."""
     covariance = held.covariance
     if not held.smoothed:
         stage = thing.stages[thing.reported_class][held.view]
@@ -121,11 +119,9 @@ def _reported(thing: Thing, k: int, told: Told) -> Mode | None:
     return Mode(1.0, held.T_world_centre, covariance)
 
 
-def _belief(thing: Thing, k: int, own: Mode, told: Told) -> Iterator[Mode]:
+def _belief(thing: Thing, k: int, held: Held, own: Mode, told: Told) -> Iterator[Mode]:
     """The modes of the reported class, the reported pose last: it is the heaviest of them."""
     recording, model, c = told.recording, told.model, thing.reported_class
-    held = thing.held(k)
-    assert held is not None
     # what a single view takes for another pose, within its own scatter, is none
     seen = _alternatives(thing, c, held.view, recording, model)
     others = [mode for mode in seen if not own.says_the_same(mode, model.shapes[c])]
@@ -135,8 +131,9 @@ def _belief(thing: Thing, k: int, own: Mode, told: Told) -> Iterator[Mode]:
     own, turned = ways_round(own, others, model.shapes[c], lead, model.config.smoother.surface_nats)
     visit = recording.run.frames[int(recording.keyframes[k])].visit
     shares = told.exchanges.at(thing.object_id, visit)
-    places = {i: _reported(told.things[i], k, told) for i in shares if told.things[i].presence_at(k) > 0.5}
-    own, modes = elsewhere(own, turned, shares, {i: mode for i, mode in places.items() if mode is not None})
+    there = ((i, told.things[i]) for i in shares if told.things[i].presence_at(k) > 0.5)
+    places = {i: _mode(other, at, told) for i, other in there if (at := other.held(k)) is not None}
+    own, modes = elsewhere(own, turned, shares, places)
     yield from modes
     yield own
 
