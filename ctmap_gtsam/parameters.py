@@ -160,6 +160,9 @@ class Smoother:
     surface_nats: float = option(
         0.3, "a thing's own surface may favour a near-symmetric way round by this in every view, nats", low=1e-3
     )
+    exchange: float = option(
+        0.1, "chance that two alike things change places in a gap between visits, however short", low=0.0, high=0.5
+    )
     rounds: int = option(2, "re-weighting rounds after the first, at most", low=2)
     max_iterations: int = option(30, "of the Levenberg-Marquardt loop a round", low=1)
     tolerance: float = option(1e-6, "relative fall of the energy at which the loop has converged", low=0.0)

@@ -29,7 +29,8 @@ _ONE_FACE = 0.98  # cosine between the normals of triangles that face one way
 _ONE_FLAT_M = 0.01  # triangles of one flat lie so near to one plane ...
 _FLAT_SHARE = 0.02  # ... and make up this share of the surface together
 _ONE_PLACE = 0.5  # of the smaller thing's radius
-NEARLY = 0.05  # a turn that moves the surface off itself by less than this share of the radius is a near-symmetry ...
+NEARLY = 0.05  # a turn that moves the surface off itself by less than this share of the radius is a near-symmetry, ...
+_ALIKE, _ALIKE_M = 0.12, 0.01  # ... or by less than this share and this much, the noise of depth from across a room ...
 _TWINS = 3  # ... of which so many are told at most
 _SAME_RAD = 0.1  # turns so near to each other are one
 _TWIN_POINTS = 1000
@@ -122,13 +123,14 @@ class Shape:
         """
         points = spread(self.mesh)
         points = points[:: -(-len(points) // _TWIN_POINTS)]
-        off = np.array([np.abs(self.distance.at(points @ R.T)).mean() for R in _TURNS]) / self.radius_m
+        off = np.array([np.abs(self.distance.at(points @ R.T)).mean() for R in _TURNS])
+        nearly = max(NEARLY * self.radius_m, min(_ALIKE * self.radius_m, _ALIKE_M))
         kept: list[Array] = [np.eye(3)]
         for k in np.argsort(off, kind="stable"):
             T = se3.make(_TURNS[k], np.zeros(3))
             there = se3.make(np.stack(kept), np.zeros((len(kept), 3)))
             apart = np.linalg.norm(residual(there, T, self.symmetry)[..., :3], axis=-1).min()
-            if off[k] < NEARLY and apart > _SAME_RAD and len(kept) <= _TWINS:
+            if off[k] < nearly and apart > _SAME_RAD and len(kept) <= _TWINS:
                 kept.append(_TURNS[k])
         return np.stack(kept)[1:]
 

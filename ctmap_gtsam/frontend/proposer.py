@@ -54,6 +54,7 @@ _RIPPLE = 2.0  # a width so many times that of the score's first fall is the sco
 _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
 _ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
 _CLOSER, _CLOSER_SHARE = 3, 0.25  # times as many starts as modes are kept, and share of all, that are looked at closely
+_MOSTLY_SEEN = 0.7  # of a silhouette: what shows less may be a thing that stands another way round about what shows
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -194,16 +195,14 @@ class Proposer:
         keep = max(2, round(share * self.settings.refined_poses))
         coarse = self._refine(shape, view, self._best(shape, view, drawn, keep), self._coarse(shape))
         best = self._best(shape, view, coarse, max(1, keep // 6))
-        starts = self._perturb(shape, best, rng)
+        starts = self._perturb(shape, view, best, rng)
         if _large(shape):
             shifted = shifted_poses(shape, best, observation.planes)
             starts = np.concatenate([starts, self._best(shape, view, shifted, keep)])
         around = self._refine(shape, view, starts, self._coarse(shape)[self._coarse_steps // 2 :])
         return np.concatenate([coarse, around])
 
-    def modes(
-        self, shape: Shape, view: View, starts: Array, probe: bool = True, near_symmetries: bool = False
-    ) -> PoseModes:
+    def modes(self, shape: Shape, view: View, starts: Array, probe: bool = True, ways_round: bool = False) -> PoseModes:
         """Refine starts (K, 4, 4) T_camera_centre, score, merge equal ones and keep the best few.
 
         Args:
@@ -212,22 +211,22 @@ class Proposer:
             starts: (K, 4, 4) T_camera_centre.
             probe: whether to climb along the axes on the score, and to take covariances from its shape (else from the
                 registration's normal equations).
-            near_symmetries: whether the best is tried as turned by each of the class's near-symmetries, too, and the
-                best of each is kept: all views decide which way round it stands, not which ways were tried.
+            ways_round: whether the best is tried as turned by each of the class's near-symmetries and about what
+                shows of it, too, and the best of each is kept: all views decide which way round it stands, not which
+                ways were tried.
         """
         if len(starts) == 0:
             return _no_modes()
         starts = self._promising(shape, view, starts)
-        twins = shape.near_symmetries if near_symmetries else np.zeros((0, 3, 3))
-        if len(twins):
-            starts = np.concatenate([starts, self._turned(shape, view, starts, twins)])
+        ways = self._ways_round(shape, view, starts) if ways_round else np.zeros((0, 4, 4))
+        starts = np.concatenate([starts, ways])
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
-        keep = self._distinct(shape, candidates, score, twins)
+        keep = self._distinct(shape, candidates, score, ways)
         if probe and view.detection is not None:
             candidates = np.concatenate([self._climb(shape, view, candidates[keep]), candidates[keep]])
             score, scores = self.score(shape, view, candidates)
-            keep = self._distinct(shape, candidates, score, twins)
+            keep = self._distinct(shape, candidates, score, ways)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe)
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
@@ -353,25 +352,46 @@ class Proposer:
     def _refine(self, shape: Shape, view: View, poses: Array, widths: Array) -> Array:
         return refine_on_depth(shape.mesh, shape.normals, view.tile, poses, widths)[0]
 
-    def _perturb(self, shape: Shape, poses: Array, rng: np.random.Generator) -> Array:
-        """Starts around poses: half-turns about the box's axes, and random turns and shifts."""
+    def _perturb(self, shape: Shape, view: View, poses: Array, rng: np.random.Generator) -> Array:
+        """Starts around poses: half-turns about the box's axes and about what shows, and random turns and shifts."""
         turned = poses[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3))
         noise = rng.normal(size=(len(poses), self.settings.perturbed_poses, 6))
         noise *= np.repeat([0.35, 0.2 * shape.radius_m], 3)
         around = retract(poses[:, None], noise)
-        return np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
+        out = np.concatenate([turned, around], axis=1).reshape(-1, 4, 4)
+        return np.concatenate([out, self._about_what_shows(shape, view, poses)])
 
-    def _turned(self, shape: Shape, view: View, poses: Array, twins: Array) -> Array:
-        """The best of poses (n, 4, 4) turned by near-symmetries (t, 3, 3): (t, 4, 4)."""
+    def _ways_round(self, shape: Shape, view: View, poses: Array) -> Array:
+        """The best of poses (n, 4, 4) as turned by near-symmetries, and about what shows: (t, 4, 4)."""
         best = self._best(shape, view.coarse(), poses, 1)
-        return np.asarray(best @ se3.make(twins, np.zeros((len(twins), 3))))
+        turned = best @ se3.make(shape.near_symmetries, np.zeros((len(shape.near_symmetries), 3)))
+        return np.concatenate([turned, self._about_what_shows(shape, view, best)])
 
-    def _distinct(self, shape: Shape, poses: Array, score: Array, twins: Array) -> list[int]:
-        """Rows of the best few poses (n, 4, 4), and beside those of the best of each near-symmetry (t, 3, 3)."""
+    def _about_what_shows(self, shape: Shape, view: View, poses: Array) -> Array:
+        """Half-turns about the middle of what is seen of poses (n, 4, 4) that are mostly hidden: (<= 3 n, 4, 4).
+
+        What shows may be another side of a thing that reaches elsewhere, and no turn about its centre leads there.
+        """
+        tile = view.tile
+        z = Rasteriser().render(shape.mesh, tile.camera, poses).astype(np.float64)
+        seen = (z > 0) & (tile.depth > 0) & (np.abs(tile.depth - z) < self.model.config.sensor.occlusion_margin_m)
+        n = seen.sum(axis=(1, 2))
+        hidden = (n > 0) & (n < _MOSTLY_SEEN * (z > 0).sum(axis=(1, 2)))
+        rows, columns = np.indices(z.shape[1:], dtype=np.float64)
+        points = tile.camera.backproject(columns, rows, z[hidden])
+        middle = np.einsum("nhw,nhwi->ni", seen[hidden], points) / n[hidden, None]
+        T = poses[hidden]
+        there = se3.inverse(T) @ se3.make(np.eye(3), middle)
+        there[:, :3, :3] = np.eye(3)
+        turned = T[:, None] @ there[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3)) @ se3.inverse(there)[:, None]
+        return turned.reshape(-1, 4, 4)
+
+    def _distinct(self, shape: Shape, poses: Array, score: Array, ways: Array) -> list[int]:
+        """Rows of the best few poses (n, 4, 4), and beside those of the best that is turned as each of (t, 4, 4)."""
         rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
         kept = rows[: self.settings.max_modes]
-        for turned in poses[rows[0]] @ se3.make(twins, np.zeros((len(twins), 3))):
-            there = symmetry.near(turned, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
+        for way in ways:
+            there = symmetry.near(way, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
             if there.any() and rows[int(np.argmax(there))] not in kept:
                 kept.append(rows[int(np.argmax(there))])
         return sorted(kept, key=lambda row: (-score[row], row))

@@ -156,7 +156,9 @@ def exchanges(things: Mapping[int, Thing], recording: Recording, model: Model) -
     """What nobody can see: in a gap between visits, two alike things that were both handled may be either.
 
     A thing was handled if it moved, and otherwise by Equation 3 at 1 - S; of two that both were, each is in the other's
-    place with probability 1/2. A thing's name is that of the visit from which most of its boxes are likely its own.
+    place with probability 1/2. Equation 3 says how long a place is held, not by which of two that nobody tells apart:
+    `smoother.exchange` of the pairs change places anyhow. A thing's name is that of the visit from which most of its
+    boxes are likely its own.
     """
     found: dict[int, dict[int, dict[int, float]]] = {}
     there = [t for _, t in sorted(things.items()) if t.exists and t.best_class == t.reported_class]
@@ -174,10 +176,11 @@ def _exchanged(a: Thing, b: Thing, recording: Recording, model: Model) -> dict[i
     visits = [recording.run.frames[int(f)].visit for f in recording.keyframes]
     n = max(visits) + 1
     handled = [_handled(thing, visits, n, recording, model) for thing in (a, b)]
-    # an even number of exchanges is ahead of an odd one by prod(1 - 2 q), q = h h / 2
+    kept = 1.0 - 2.0 * model.config.smoother.exchange
+    # an even number of exchanges is ahead of an odd one by prod(1 - 2 q), for handled ones q = h h / 2
     ahead = np.eye(n)
     for v in range(n - 1):
-        ahead[: v + 1, v + 1] = ahead[: v + 1, v] * (1.0 - handled[0][v] * handled[1][v])
+        ahead[: v + 1, v + 1] = ahead[: v + 1, v] * (1.0 - handled[0][v] * handled[1][v]) * kept
     odd = 0.5 * (1.0 - np.maximum(ahead, ahead.T))
     seen = np.bincount([visits[k] for thing in (a, b) for k in thing.boxes], minlength=n)
     named = int(np.argmin(odd @ seen))

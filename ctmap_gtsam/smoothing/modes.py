@@ -214,7 +214,7 @@ def sight(at: Look, proposer: Proposer, wish: Wanted, known: Sighting | None = N
             context.append(np.zeros(0) if known is None else known.context[shape.index])
             continue
         careful = shape.index in wish.careful
-        found = proposer.modes(shape, at.view, T_camera_world @ starts, probe=careful, near_symmetries=careful)
+        found = proposer.modes(shape, at.view, T_camera_world @ starts, probe=careful, ways_round=careful)
         modes.append(found)
         context.append(at.around.log_potential(model, shape, at.T_world_camera @ found.T_camera_centre))
     return Sighting(at.keyframe, tuple(modes), tuple(context), _log_clutter(proposer, at.view, modes, at.first))

@@ -14,6 +14,7 @@ from factors.symmetry import residual
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh
 from sequences.geometry import find_planes
+from sequences.rendering.rasteriser import Rasteriser
 from sequences.seeds import generator
 from tests.ctmap_gtsam.scenes import (
     box_of,
@@ -135,12 +136,37 @@ def test_whichever_way_round_it_is_tried_both_ways_are_modes(seed):
     proposer, shape, view, _, T = scene("banana", seed)
     turned = T @ se3.make(shape.near_symmetries, np.zeros((1, 3)))
     for start in (T[None], turned):
-        modes = proposer.modes(shape, view, start, near_symmetries=True)
+        modes = proposer.modes(shape, view, start, ways_round=True)
         turn, shift = errors(T, modes.T_camera_centre[0], shape)
         assert turn < 0.05
         assert shift < 0.003
         assert (errors(turned[0], modes.T_camera_centre, shape)[0] < 0.4).any()
         assert (np.diff(modes.log_likelihood) <= 0).all()
+
+
+def test_what_is_taken_for_the_other_end_of_a_hidden_thing_is_tried_the_other_way():
+    """It shows one end, and the rest of it lies in sight there, not behind what stands beside it."""
+    proposer, shape, view, _, T = scene("hammer")
+    z = Rasteriser().render(shape.mesh, view.tile.camera, T[None])[0]
+    columns = np.flatnonzero((z > 0).any(axis=0))
+    edge = columns[0] + round(0.1 * len(columns))
+    depth = view.tile.depth.copy()
+    depth[:, :edge] = 0.3
+    view = replace(view, tile=replace(view.tile, depth=depth))
+    v, u = np.nonzero(
+        (z > 0) & (np.arange(z.shape[1]) >= edge) & (np.arange(z.shape[1]) < columns[0] + 0.3 * len(columns))
+    )
+    end = se3.make(np.eye(3), (se3.inverse(T) @ [*view.tile.camera.backproject(u, v, z[v, u]).mean(axis=0), 1.0])[:3])
+    turns = [np.diag(d) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
+    others = np.stack([T @ end @ se3.make(R, np.zeros(3)) @ se3.inverse(end) for R in turns])
+    _, scores = proposer.score(shape, view, others)
+    start = others[np.argmin(scores.visible / scores.covered)]
+    found = proposer.modes(shape, view, start[None], ways_round=True)
+    alone = proposer.modes(shape, view, start[None])
+    turned, moved = errors(T, found.T_camera_centre[:1], shape)
+    assert turned[0] < 0.05
+    assert moved[0] < 0.01
+    assert errors(T, alone.T_camera_centre, shape)[1].min() > 0.05
 
 
 def test_no_mode_scores_less_than_its_start():

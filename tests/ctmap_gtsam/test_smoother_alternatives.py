@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
+from ctmap_gtsam.model import Model
 from ctmap_gtsam.smoothing.alternatives import Mode, elsewhere, exchanges, leads, ways_round
 from sequences import se3
 from tests.ctmap_gtsam.scenes import model_of, shape_named
@@ -104,15 +105,21 @@ def test_two_alike_things_that_both_were_moved_may_be_either():
     assert found.at(2, visit) == {1: found.at(1, visit)[2]}
 
 
-def test_who_stayed_was_handled_as_equation_3_says():
-    found = exchanged(stays(1, HERE, range(8)), stays(2, THERE, range(8)))
+@pytest.mark.parametrize("chance", [0.0, 0.1, 0.5])
+def test_who_stayed_was_handled_as_equation_3_says_or_exchanged_anyhow(chance):
+    """Two independent causes: an odd number of exchanges is one of them without the other."""
+    model = Model(MODEL.catalogue, replace(MODEL.config, smoother=replace(MODEL.config.smoother, exchange=chance)))
+    pair = {1: stays(1, HERE, range(8)), 2: stays(2, THERE, range(8))}
+    found = exchanges(pair, RECORDING, model)
     handled = 1.0 - MODEL.stay_probability(MODEL.shapes[0].source, RECORDING.time_s(4) - RECORDING.time_s(3))
+    both = 0.5 * handled**2
     (visit,) = found.in_place_of[1]
-    assert found.at(1, visit)[2] == pytest.approx(0.5 * handled**2, abs=0.01)
+    assert found.at(1, visit)[2] == pytest.approx(both * (1.0 - chance) + chance * (1.0 - both), abs=0.01)
 
 
 def test_within_a_visit_nothing_is_exchanged():
-    assert exchanged(stays(1, HERE, range(4)), stays(2, THERE, range(4))).in_place_of.get(1, {}) == {}
+    found = exchanged(stays(1, HERE, range(4)), stays(2, THERE, range(4)))
+    assert found.at(1, 0) == found.at(2, 0) == {}
 
 
 def test_no_order_of_things_matters():
