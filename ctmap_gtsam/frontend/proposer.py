@@ -54,7 +54,7 @@ _RIPPLE = 2.0  # a width so many times that of the score's first fall is the sco
 _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on each
 _ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
 _CLOSER, _CLOSER_SHARE = 3, 0.25  # times as many starts as modes are kept, and share of all, that are looked at closely
-_MOSTLY_SEEN = 0.7  # of a silhouette: what shows less may be a thing that stands another way round about what shows
+_MOSTLY_SEEN = 0.85  # of what is measured of a silhouette: less of it, and it may stand another way about what shows
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -374,11 +374,12 @@ class Proposer:
         """
         tile = view.tile
         z = Rasteriser().render(shape.mesh, tile.camera, poses).astype(np.float64)
-        seen = (z > 0) & (tile.depth > 0) & (np.abs(tile.depth - z) < self.model.config.sensor.occlusion_margin_m)
+        measured = (z > 0) & (tile.depth > 0)
+        seen = measured & (np.abs(tile.depth - z) < self.model.config.sensor.occlusion_margin_m)
         n = seen.sum(axis=(1, 2))
-        hidden = (n > 0) & (n < _MOSTLY_SEEN * (z > 0).sum(axis=(1, 2)))
-        rows, columns = np.indices(z.shape[1:], dtype=np.float64)
-        points = tile.camera.backproject(columns, rows, z[hidden])
+        hidden = (n > 0) & (n < _MOSTLY_SEEN * measured.sum(axis=(1, 2)))
+        at = np.indices(z.shape[1:]).astype(np.float64)
+        points = tile.camera.backproject(at[1], at[0], z[hidden])
         middle = np.einsum("nhw,nhwi->ni", seen[hidden], points) / n[hidden, None]
         T = poses[hidden]
         there = se3.inverse(T) @ se3.make(np.eye(3), middle)
