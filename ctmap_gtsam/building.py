@@ -17,7 +17,7 @@ from sequences.types import LocalisationNoise, Run
 
 Array = NDArray[np.float64]
 
-GRAPH_POTENTIALS = ("localisation", "bias", "measurement", "prediction", "context", "gauge")
+GRAPH_POTENTIALS = ("localisation", "bias", "measurement", "prediction", "context", "standing", "gauge")
 """those that are factors of the smoother's graph, relative to their greatest value: their sum is minus its energy"""
 
 POTENTIALS = (

@@ -187,6 +187,38 @@ class Gauges:
 
 
 @dataclass(frozen=True, eq=False)
+class Standings:
+    """That a thing stands flat: directions of it are level, with a Gaussian error of the sine. Key: T_world_object."""
+
+    level: Array
+    """(m, 3) unit vectors of the object's frame, one set for all"""
+    up: Array
+    """(3,) unit vector, world frame"""
+    sigma_rad: Array
+    """(...)"""
+    keyframes: Array
+    """(...) over how many keyframes this one fact is spread"""
+
+    @property
+    def rows(self) -> int:
+        """See `Terms`."""
+        return len(self.level)
+
+    def linearised(self, values: Sequence[Array]) -> Linearised:
+        """See `Terms`."""
+        up = np.swapaxes(values[0][..., :3, :3], -1, -2) @ self.up
+        weight = 1.0 / (self.sigma_rad * np.sqrt(self.keyframes))
+        # R exp(w) turns what is up by -w in the object's frame: its change is up x w
+        turned = np.cross(self.level, up[..., None, :])
+        J = np.concatenate([turned, np.zeros_like(turned)], axis=-1)
+        return weight[..., None] * (up @ self.level.T), (weight[..., None, None] * J,)
+
+    def __getitem__(self, index: int) -> Standings:
+        """See `Terms`."""
+        return replace(self, sigma_rad=self.sigma_rad[index], keyframes=self.keyframes[index])
+
+
+@dataclass(frozen=True, eq=False)
 class Contexts:
     """phi_c between two objects at one time; see `factors.context`. Keys: T_world_object of one and of the other."""
 

@@ -33,6 +33,7 @@ COLOURS = {
     "measurement": "#0072b2",
     "prediction": "#009e73",
     "context": "#cc79a7",
+    "standing": "#56b4e9",
     "gauge": "#e69f00",
 }
 _SCALE = Normalize(0.0, 10.0)  # nats, of the picture's colours

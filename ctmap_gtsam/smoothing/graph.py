@@ -19,14 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmap_gtsam.frontend.company import Company, Partner
+from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.batched import Batch, Problem
+from ctmap_gtsam.smoothing.footing import footings
 from ctmap_gtsam.smoothing.solver import Solution, optimise
 from factors import symmetry
 from factors.custom import stay_factor, terms_factor
-from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions
+from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions, Standings
 from sequences import se3
 from sequences.types import LocalisationNoise
 
@@ -91,7 +93,7 @@ class Label:
     """What a factor is."""
 
     kind: str
-    """localisation, bias, measurement, prediction, context, gauge, carried"""
+    """localisation, bias, measurement, prediction, context, standing, gauge, carried"""
     name: str
     keys: tuple[int, ...]
 
@@ -312,6 +314,7 @@ def build(
     objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
     carried: Carried | None = None,
     company: Mapping[int, Company] | None = None,
+    place: Place | None = None,
 ) -> SmootherGraph:
     """The graph of a run, or of a window of it.
 
@@ -323,6 +326,7 @@ def build(
             variable is carried, else none.
         carried: what came before the window; None where it is the whole run. Cameras are given from the first of all.
         company: visit -> who was moved together; None = nobody.
+        place: on which things stand; None = nowhere.
     """
     built = SmootherGraph()
     first = 0
@@ -334,7 +338,7 @@ def build(
     _add_cameras(built, cameras, noise, first)
     for row, (shape, measured) in objects.items():
         built.objects[row] = shape.source.name
-        _add_object(built, model, row, shape, measured, cameras)
+        _add_object(built, model, row, shape, measured, cameras, place if model.context else None)
     if model.context:
         _add_context(built, model, objects, first, company or {})
     return built
@@ -395,7 +399,13 @@ def _drifts(drifting: Sequence[int], cameras: Sequence[Camera], noise: Localisat
 
 
 def _add_object(
-    built: SmootherGraph, model: Model, row: int, shape: Shape, measured: Sequence[Measured], cameras: Sequence[Camera]
+    built: SmootherGraph,
+    model: Model,
+    row: int,
+    shape: Shape,
+    measured: Sequence[Measured],
+    cameras: Sequence[Camera],
+    place: Place | None,
 ) -> None:
     if not measured:
         return
@@ -412,6 +422,8 @@ def _add_object(
     if len(measured) > old:
         new = slice(old, None)
         _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new], names[new])
+        if place is not None:
+            _add_standing(built, model, shape, place, measured[new], T[new], keys[new], names[new])
     _add_predictions(built, model, S, measured, keys, names)
 
 
@@ -438,6 +450,30 @@ def _add_measurements(
     built.add_batch(Batch("measurement", names, np.array(seen_by), modes))
     if S.free:
         built.add_batch(Batch("gauge", names, keys[:, None], Gauges(T, S)))
+
+
+def _add_standing(
+    built: SmootherGraph,
+    model: Model,
+    shape: Shape,
+    place: Place,
+    measured: Sequence[Measured],
+    T: Array,
+    keys: NDArray[np.int64],
+    names: tuple[str, ...],
+) -> None:
+    """That it stands flat while it stays: a fact spread over the keyframes between which it can't have tipped."""
+    up = place.up_world
+    tilt = model.config.context.standing_tilt_rad
+    as_one_s = (tilt / model.config.prediction.rotation_rate) ** 2
+    for footing in footings(T, [m.stays for m in measured], shape, place, model):
+        assert up is not None
+        time_s = np.array([measured[i].time_s for i in footing.rows])
+        shared = (np.abs(time_s[:, None] - time_s) <= as_one_s).sum(axis=1)
+        sigma = np.full(len(shared), tilt)
+        at = tuple(names[i] for i in footing.rows)
+        terms = Standings(footing.level, up, sigma, shared)
+        built.add_batch(Batch("standing", at, keys[footing.rows, None], terms))
 
 
 def _one_image(T: Array, S: symmetry.Symmetry) -> Array:

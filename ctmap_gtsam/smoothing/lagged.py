@@ -348,8 +348,9 @@ class _Walk:
         things = {i: thing.with_poses(self._history(thing)) for i, thing in things.items()}
         first = self.window.first
         chosen = objects_of(things, self.recording, self.model)
-        noise = self.recording.run.localisation
-        smoothed, self.window = self.window.solve(self.model, self.cameras, noise, chosen, self.company)
+        noise, place = self.recording.run.localisation, self.recording.place
+        solved = self.window.solve(self.model, self.cameras, noise, chosen, self.company, place)
+        smoothed, self.window = solved
         self.ends[smoothed.solution.end] += 1
         if self.solution is None or self.solution.end == "converged" or smoothed.solution.end != "converged":
             self.solution = smoothed.solution

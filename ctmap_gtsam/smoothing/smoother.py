@@ -238,7 +238,7 @@ def _graph(
     """The graph of all that is, and what each object was taken for."""
     cameras = [camera_of(recording, k) for k in range(len(recording.keyframes))]
     objects = objects_of(things, recording, model)
-    return build(model, cameras, recording.run.localisation, objects, company=company), objects
+    return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place), objects
 
 
 def _settled(a: Map, b: Map, model: Model) -> bool:

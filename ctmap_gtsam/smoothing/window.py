@@ -16,6 +16,7 @@ from typing import Any
 import gtsam
 
 from ctmap_gtsam.frontend.company import Company
+from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.graph import (
@@ -59,6 +60,7 @@ class Window:
         noise: LocalisationNoise,
         objects: Objects,
         company: Mapping[int, Company] | None = None,
+        place: Place | None = None,
     ) -> tuple[Smoothed, Window]:
         """Solve the window up to the last camera, and slide it so that the next keyframe fits in.
 
@@ -69,6 +71,7 @@ class Window:
             objects: object -> its class and chosen modes in order of time; older ones than the window are not used but
                 to see whether what was carried of the object still holds.
             company: visit -> who was moved together; None = nobody.
+            place: on which things stand; None = nowhere.
 
         Returns:
             The solution, whose cameras begin at `first`, and the next window.
@@ -76,7 +79,7 @@ class Window:
         window = self._without([i for i in self.left if not self._holds(i, objects.get(i))])
         inside = {i: (shape, window._inside(i, measured)) for i, (shape, measured) in objects.items()}
         inside = {i: entry for i, entry in inside.items() if entry[1]}
-        built = build(model, cameras, noise, inside, window.carried, company)
+        built = build(model, cameras, noise, inside, window.carried, company, place)
         smoothed = smooth(built, model, inside, len(cameras), self.first)
         begin = len(cameras) + 1 - self.length
         return smoothed, window._slid(begin, built, smoothed.solution.values, inside, cameras)

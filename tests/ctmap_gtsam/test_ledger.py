@@ -23,7 +23,7 @@ from tests.ctmap_gtsam.scenes import CHEAP, config_of, looking, model_of, shape_
 
 QUICK = (*CHEAP, "frontend.start_after=2", "frontend.angular_step_rad=0.01", "frontend.mesh_faces=200")
 CONFIG = config_of(*QUICK)
-GRAPH = ("localisation", "bias", "measurement", "prediction", "context", "gauge")
+GRAPH = ("localisation", "bias", "measurement", "prediction", "context", "standing", "gauge")
 FOOD = model_of("soup_can", "banana", "mug")
 
 
@@ -85,7 +85,7 @@ def test_each_factor_is_a_line_of_its_own_objects_and_keyframe(answers):
     values = solution.solution.values
     for label, error in zip(built.labels, built.errors(values), strict=True):
         words = label.name.split()
-        if label.kind in ("measurement", "gauge", "prediction"):
+        if label.kind in ("measurement", "gauge", "prediction", "standing"):
             found = nats(estimate, label.kind, object=rows[int(words[1])], keyframe=int(words[3]), other=-1)
         elif label.kind == "context":
             pair = {"object": rows[int(words[1])], "other": rows[int(words[3])]}

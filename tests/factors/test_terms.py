@@ -6,7 +6,7 @@ from hypothesis import given, settings
 
 from factors import context, prediction
 from factors.instance import among_log_ratio, instance_log_ratio, instance_relation
-from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions
+from factors.terms import Contexts, Drifts, Gauges, Modes, Partners, Predictions, Standings
 from sequences import se3
 from tests.factors.strategies import SEEDS, SYMMETRIES, numerical_jacobian, random_image, random_pose, random_spd
 
@@ -49,6 +49,25 @@ def test_modes_predictions_and_gauges(symmetry, seed):
     assert_one_by_one(Predictions(sigma, symmetry, near(rng, placed)), [placed, near(rng, placed)])
     if symmetry.free:
         assert_one_by_one(Gauges(placed, symmetry), [near(rng, placed)])
+
+
+@given(SEEDS)
+def test_standing_is_the_sine_of_the_tilt_and_no_turn_about_up_changes_it(seed):
+    rng = np.random.default_rng(seed)
+    placed, yaw = some(rng, random_pose), rng.uniform(-3, 3)
+    face, up = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.linalg.qr(rng.normal(size=(3, 3)))[0][0]
+    terms = Standings(face[:2], up, rng.uniform(0.01, 0.1, N), rng.integers(1, 9, N))
+    assert_one_by_one(terms, [placed])
+    r, (J,) = terms.linearised([placed])
+    sine = np.linalg.norm(np.cross(placed[:, :3, :3] @ face[2], up), axis=-1)
+    np.testing.assert_allclose((r**2).sum(axis=-1), sine**2 / terms.sigma_rad**2 / terms.keyframes, rtol=1e-9)
+    turned = se3.make(se3.so3_exp(yaw * up), rng.normal(size=3)) @ placed
+    np.testing.assert_allclose(terms.linearised([turned])[0], r, atol=1e-9)
+
+    def alone(T):
+        return terms[2].linearised([T])[0] if T.ndim == 2 else np.stack([terms[2].linearised([t])[0] for t in T])
+
+    np.testing.assert_allclose(J[2], numerical_jacobian(alone, placed[2]), rtol=1e-5, atol=1e-5)
 
 
 @each_symmetry
