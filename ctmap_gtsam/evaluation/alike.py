@@ -51,8 +51,8 @@ class Surface:
 
 def confusable(catalogue: Catalogue) -> frozenset[int]:
     """obj_id of the classes that look like another one of the catalogue."""
-    rivalled = look_alikes(catalogue).any(axis=1)
-    return frozenset(c.obj_id for c, rival in zip(catalogue.classes, rivalled, strict=True) if rival)
+    rivalled = np.flatnonzero(look_alikes(catalogue).any(axis=1))
+    return frozenset(catalogue.obj_ids[k] for k in rivalled)
 
 
 def look_alikes(catalogue: Catalogue, within_m: float = ALIKE_M) -> Bools:

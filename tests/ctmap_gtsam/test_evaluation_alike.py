@@ -11,8 +11,8 @@ from ctmap_gtsam.evaluation.alike import ALIKE_M, Surface, confusable, look_alik
 from ctmap_gtsam.evaluation.frames import FrameErrors, class_metrics
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh
-from sequences.simulation.shapes import household
 from sequences.simulation.shapes import catalogue as catalogue_of
+from sequences.simulation.shapes import household
 from tests.ctmap_gtsam import synthetic
 
 NAMES = ("milk_carton", "shampoo_bottle", "soap", "computer_mouse", "book", "drill", "toilet_roll")
