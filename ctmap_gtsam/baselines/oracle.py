@@ -2,8 +2,8 @@
 
 The paper takes the frame of each sequence in which an object is last seen, crops the point cloud by the true box and
 registers the object's mesh to it. Here that is done for each true object in each visit, with the box of its visible
-pixels, and the pose is held over all of the visit. No other method reads the truth, and none that does may be held
-against one that doesn't but in the way of the paper.
+pixels, and the pose is held over all of the visit. Beside these `cameras` alone reads the truth, and no method that
+does may be held against one that doesn't but in the way of the paper.
 """
 
 from __future__ import annotations
