@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ctmap_gtsam.baselines import oracle, registration
+from ctmap_gtsam.baselines.cameras import cameras_of_known_objects
 from ctmap_gtsam.baselines.copying import copy_back
 from ctmap_gtsam.baselines.detected import register_detections
 from ctmap_gtsam.baselines.fusion import static_fusion
@@ -116,6 +117,8 @@ METHODS: dict[str, Method] = {
                "estimate", partial(oracle.register_truth, kind="icp"), _needs_truth, reads_truth=True),
         Method("fpfh-oracle", "FPFH and RANSAC in the same: reads the truth",
                "estimate", partial(oracle.register_truth, kind="fpfh"), _needs_truth, reads_truth=True),
+        Method("cameras-oracle", "the cameras by the smoother's graph of one who knows the objects: reads the truth",
+               "estimate", cameras_of_known_objects, oracle.obstacle, reads_truth=True),
         Method("static-fusion", "one pose an object and visit, fused from all keyframes: nothing moves, no context",
                "estimate", static_fusion, _needs_detections),
         Method("paper-t", "T-Map to the letter of the paper", "estimate",

@@ -2,8 +2,8 @@
 
 The paper takes the frame of each sequence in which an object is last seen, crops the point cloud by the true box and
 registers the object's mesh to it. Here that is done for each true object in each visit, with the box of its visible
-pixels, and the pose is held over all of the visit. No other method reads the truth, and none that does may be held
-against one that doesn't but in the way of the paper.
+pixels, and the pose is held over all of the visit. Beside these `cameras` alone reads the truth, and no method that
+does may be held against one that doesn't but in the way of the paper.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def register_truth(run: Run, config: Config, progress: Progress = SILENT, *, kin
     with progress.stage(method, total=len(sightings)) as stage:
         for f, things in sightings.items():
             frame, depth = run.frames[f], run.frames[f].read_depth()
-            for thing, box in _true_boxes(run.catalogue, truth, frame, things):
+            for thing, box in true_boxes(run.catalogue, truth, frame, things):
                 found = registrar.register(thing.obj_id, frame, depth, box, thing.inst_id)
                 if found is not None:
                     probability = certainly(run.catalogue.index(thing.obj_id), len(run.catalogue))
@@ -85,7 +85,7 @@ def _last_sightings(run: Run, truth: Truth) -> dict[int, list[TrueObject]]:
     return dict(sorted(found.items()))
 
 
-def _true_boxes(
+def true_boxes(
     catalogue: Catalogue, truth: Truth, frame: Frame, things: list[TrueObject]
 ) -> list[tuple[TrueObject, Array]]:
     """Boxes (4,) of the visible pixels: the truth's own, else drawn; true objects alone hide each other then."""

@@ -59,8 +59,9 @@ def estimate_of(
     placements: Mapping[int, Sequence[Placement | None]],
     shapes: Sequence[Shape],
     extra: Mapping[str, Any] | None = None,
+    cameras: tuple[Array, Array] | None = None,
 ) -> Estimate:
-    """Put placements together; what is placed exists, what isn't doesn't; cameras are the recorded ones.
+    """Put placements together; what is placed exists, what isn't doesn't.
 
     Args:
         run: the recording.
@@ -70,6 +71,7 @@ def estimate_of(
         placements: object_id -> one for each keyframe, None where it isn't in the map.
         shapes: one a class, in the catalogue's order.
         extra: more meta data.
+        cameras: T_world_camera (K, 4, 4) and covariances (K, 6, 6); None = as recorded.
     """
     objects = sorted(placements)
     tables = Tables(len(objects), len(keyframes), len(shapes))
@@ -85,10 +87,15 @@ def estimate_of(
         keyframes,
         objects,
         tables,
-        np.stack([frame.T_world_camera for frame in frames]),
-        np.tile(localisation_covariance(run.localisation), (len(frames), 1, 1)),
+        *(cameras or _recorded(run, frames)),
         extra or {},
     )
+
+
+def _recorded(run: Run, frames: Sequence[Frame]) -> tuple[Array, Array]:
+    """Recorded cameras, and what is said of their error."""
+    covariance = np.tile(localisation_covariance(run.localisation), (len(frames), 1, 1))
+    return np.stack([frame.T_world_camera for frame in frames]), covariance
 
 
 def in_view(shape: Shape, T_world_object: Array, frame: Frame) -> bool:

@@ -169,7 +169,7 @@ def show_summary(path: Path) -> None:
         if method["status"] == "skipped":
             typer.echo(f"{name} skipped: {method['reason']} {method['remedy']}".rstrip())
         elif method["reads_truth"]:
-            typer.echo(f"{name} reads the truth: true boxes and classes")
+            typer.echo(f"{name} reads the truth")
 
 
 def _show_table(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:

@@ -7,7 +7,7 @@ boxes' centres, stays finite. A median is infinite where half of the object-fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -63,10 +63,17 @@ AUC_M = 0.1
 THRESHOLDS = {"2cm_10deg": (0.02, np.deg2rad(10.0)), "5cm_15deg": (0.05, np.deg2rad(15.0))}
 """The named points of the curves of pose accuracy, metres and rad"""
 
-CLASSES = ("class_accuracy", "class_accuracy_last_half", "class_log_score", "class_brier_score")
+CLASSES = (
+    "class_accuracy",
+    "class_accuracy_last_half",
+    "class_log_score",
+    "class_brier_score",
+    "class_log_score_confusable",
+    "class_brier_score_confusable",
+)
 """Metrics that need none. class_accuracy_last_half: over the second half of each run's frames. The scores are of the
 belief over the classes and "nothing there", as logarithm (Good, Rational decisions, 1952) and square (Brier, 1950):
-lower is better"""
+lower is better. *_confusable: at the objects whose class looks like another one of the catalogue (`alike`)"""
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,8 @@ class FrameErrors:
     """in the second half of the run's frames"""
     situation: Ints
     """position in SITUATIONS"""
+    confusable: Bools
+    """whether the true class looks like another one of the catalogue"""
     class_id: Ints
     """what the method says, -1 where it says nothing"""
     class_correct: Bools
@@ -113,8 +122,12 @@ def frame_errors(
     matching: Matching,
     shapes: dict[int, Shape],
     measured: Mapping[int, Scene],
+    confusable: Collection[int],
 ) -> FrameErrors:
-    """(N, F) how a method fares at the true objects, by `matching`; VSD in the frames of `measured` (`vsd.scenes`)."""
+    """(N, F) how a method fares at the true objects, by `matching`.
+
+    VSD in the frames of `measured` (`vsd.scenes`); `confusable` are the classes of which `alike.confusable` tells.
+    """
     said = detection.matched_class(method.objects, matching)
     translation, rotation, mssd, add, adds, mspd = (np.where(truth.visible, np.inf, np.nan) for _ in range(6))
     diameters, widths = np.ones(truth.visible.shape), np.array([frame.camera.width for frame in run.frames])
@@ -136,6 +149,7 @@ def frame_errors(
     return FrameErrors(
         late=_late(truth),
         situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
+        confusable=np.isin(truth.class_id, list(confusable)),
         class_id=said,
         class_correct=detection.class_correct(truth, method.objects, matching),
         class_probability=np.array([b.probability for b in beliefs]).reshape(truth.visible.shape),
@@ -165,12 +179,15 @@ def _recall(error: Array) -> Array:
     return np.where(np.isnan(error), np.nan, (error[..., None] < SHARES).mean(axis=-1))
 
 
-def detector_errors(run: Run, score: detection.DetectorScore, truth: ObjectFrames) -> FrameErrors:
+def detector_errors(
+    run: Run, score: detection.DetectorScore, truth: ObjectFrames, confusable: Collection[int]
+) -> FrameErrors:
     """(N, F) the same of the detector's boxes, which have classes and no poses."""
     nothing = np.where(truth.visible, np.inf, np.nan)
     return FrameErrors(
         late=_late(truth),
         situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
+        confusable=np.isin(truth.class_id, list(confusable)),
         class_id=score.class_id,
         class_correct=(score.class_id == truth.class_id) & truth.present,
         class_probability=score.class_probability,
@@ -277,6 +294,8 @@ def class_metrics(errors: FrameErrors) -> dict[str, float | None]:
         "class_accuracy_last_half": mean(errors.class_correct[errors.late]),
         "class_log_score": log_score(errors.class_probability),
         "class_brier_score": mean(errors.class_square),
+        "class_log_score_confusable": log_score(errors.class_probability[errors.confusable]),
+        "class_brier_score_confusable": mean(errors.class_square[errors.confusable]),
     }
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation import calibration, frames, moves, trajectory, visits
+from ctmap_gtsam.evaluation.alike import confusable
 from ctmap_gtsam.evaluation.boxes import (
     JudgedBoxes,
     TrueBoxes,
@@ -45,7 +46,7 @@ from sequences.types import Run, Truth
 
 Array = NDArray[np.float64]
 
-SCHEMA = 3
+SCHEMA = 4
 
 DETECTOR = "detector"
 """Name of the method that is the recorded boxes, which have no poses"""
@@ -176,11 +177,16 @@ class Judge:
         """The depth images that VSD looks at."""
         return scenes(self.run, self._step)
 
+    @cached_property
+    def confusable(self) -> frozenset[int]:
+        """The classes that look like another one."""
+        return confusable(self.run.catalogue)
+
     def estimate(self, method: MethodMap) -> Judgement:
         """Judge a method that has poses."""
         matching = match(self.objects, method.objects, self.shapes)
         case = self.run, method, self.objects, matching
-        errors = frames.frame_errors(*case, self.shapes, self.scenes)
+        errors = frames.frame_errors(*case, self.shapes, self.scenes, self.confusable)
         obj_ids = self.run.catalogue.obj_ids
         own = [view.boxes() for view in views(self.run, method.estimate, self._step, DOUBTFUL)]
         final = [view.boxes() for view in final_views(self.run, method.estimate, self._step, DOUBTFUL)]
@@ -208,7 +214,7 @@ class Judge:
     def detector(self) -> Judgement:
         """Judge the recorded boxes, each as its best class with that class's score."""
         score = score_detections(self.run, self.objects, self.boxes)
-        errors = frames.detector_errors(self.run, score, self.objects)
+        errors = frames.detector_errors(self.run, score, self.objects, self.confusable)
         boxes = judge_boxes(self.boxes, best_classes(self.run), self.run.catalogue.obj_ids)
         record = self._record(
             DETECTOR,

@@ -72,6 +72,8 @@ MORE_COLUMNS = (
     Column("false_moves", "false moves", "", "d", "low", "moves claimed of what stayed"),
     Column("coverage_95", "coverage", "%", ".0f", "", "share of true poses in the regions that should hold 95 %", 100),
     Column("class_log_score", "log score", "nats", ".2f", "low", "-log P of the true class; mean"),
+    Column("class_log_score_confusable", "of look-alikes", "nats", ".2f", "low",
+           "the same of classes whose mesh is like another one's"),
 )  # fmt: skip
 """What else a method is judged by"""
 
