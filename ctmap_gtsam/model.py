@@ -104,7 +104,8 @@ class Model:
         """
         sensor = self.config.sensor
         turned = np.hypot(sensor.bias_rotation_rad, sensor.bias_surface_m / shape.radius_m)
-        return np.repeat([turned, sensor.bias_translation_m], 3)
+        moved = np.hypot(sensor.bias_translation_m, sensor.bias_size * shape.radius_m)
+        return np.repeat([turned, moved], 3)
 
     def shared_variance(self, shape: Shape, localisation: LocalisationNoise, away_m: float) -> Array:
         """(6,) by how much all that one view says of an object's pose in the world may be off together.

@@ -36,6 +36,7 @@ class Sensor:
         0.01, "error shared by the depth measurements of one object and visit, rad", low=1e-6
     )
     bias_translation_m: float = option(0.001, "the same, metres", low=1e-7)
+    bias_size: float = option(0.004, "what large things are off besides: this share of their radius", low=0.0)
     bias_surface_m: float = option(
         0.002, "how far off a thing's surface may be as a whole: turns it by this over its radius, metres", low=0.0
     )

@@ -131,7 +131,9 @@ def make_task(config: Config, poses: int, *, drifting: bool = False) -> Task:
     """
     rng = generator(config.seed, "bench.solver")
     if not drifting:
-        still = dict.fromkeys(("bias_rotation_rad", "bias_translation_m", "bias_surface_m"), NEXT_TO_NOTHING)
+        still = dict.fromkeys(
+            ("bias_rotation_rad", "bias_translation_m", "bias_surface_m", "bias_size"), NEXT_TO_NOTHING
+        )
         config = replace(config, sensor=replace(config.sensor, **still))
     model = Model(catalogue(tuple(s for s in household() if s.object_class.name == "mug")), config, context=False)
     noise = LocalisationNoise(CAMERA_SIGMAS[0], CAMERA_SIGMAS[3], DRIFT_S if drifting else 1e-3 * STEP_S)

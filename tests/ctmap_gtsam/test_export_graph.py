@@ -21,6 +21,7 @@ CONFIG = config_of(
     "sensor.bias_rotation_rad=1e-6",
     "sensor.bias_translation_m=1e-7",
     "sensor.bias_surface_m=0",
+    "sensor.bias_size=0",
 )
 K = 6
 

@@ -26,6 +26,7 @@ CONFIG = config_of(
     "sensor.bias_rotation_rad=1e-6",
     "sensor.bias_translation_m=0.0015",
     "sensor.bias_surface_m=0",
+    "sensor.bias_size=0",
     "smoother.tolerance=1e-12",
 )
 MODEL = Model(classes("mug"), CONFIG, context=False)
@@ -167,7 +168,12 @@ def views_with(spread, n):
 
 @pytest.mark.parametrize("n", [1, 4, 60])
 def test_a_turn_that_no_view_shows_stays_open_however_many_there_are(n):
-    exact = ("prediction.rotation_rate=1e-6", "sensor.bias_rotation_rad=1e-3", "sensor.bias_surface_m=0")
+    exact = (
+        "prediction.rotation_rate=1e-6",
+        "sensor.bias_rotation_rad=1e-3",
+        "sensor.bias_surface_m=0",
+        "sensor.bias_size=0",
+    )
     model = Model(classes("mug"), config_of(*exact), context=False)
     open_rad = PROBED_M / MUG.radius_m
     turn = se3.so3_exp(np.array([0.3, -0.5, 0.2]))[:, 2]
