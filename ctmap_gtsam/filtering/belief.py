@@ -21,6 +21,7 @@ from ctmap_gtsam.filtering.particles import (
     modes_of,
     predict,
     predicted_log_density,
+    sufficient,
 )
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.landing import landing_log_density
@@ -685,13 +686,14 @@ class Updater:
             return None
         settings = self.model.config.filter
         share = 1.0 if own is None else settings.proposal_share if proposals is not None else 0.0
-        n_proposed = round(share * count)
         drawn = []
-        prior = None
-        if own is not None and change is not None:
-            # what is hardly possible isn't worth it
-            sure = count > settings.min_particles
-            prior = filled(own.particles, change.spread, shape, rng) if sure else own.particles
+        prior = None if own is None else own.particles
+        # what is hardly possible isn't worth it
+        if own is not None and change is not None and count > settings.min_particles:
+            prior = filled(own.particles, change.spread, shape, rng)
+            count = sufficient(prior, count, shape)
+        n_proposed = round(share * count)
+        if prior is not None and change is not None:
             drawn.append(predict(prior, count - n_proposed, change.spread, shape, rng))
         if proposals is not None:
             drawn.append(proposals.draw(n_proposed, shape, rng))
