@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
 _DORMANT = (45.0, 0.25)  # nats behind the best class, and share of its evidence, beyond which a class sleeps
+_STARTS = 3  # heaviest particles that a likely class's modes are looked for from
 _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighed and searched for
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
 _LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
@@ -143,6 +144,8 @@ class _Effort:
     """effort of a fresh search, as a share of the first one's; 0 = none"""
     standard: _Standard | None
     """what the poses that a search finds are held to, beside what is believed"""
+    spread: Spread
+    """of the prediction since its place was last in view"""
 
 
 @dataclass(frozen=True)
@@ -565,9 +568,11 @@ class Updater:
         if view.detection is not None and (named != best or lost):
             awake[named], efforts[named] = True, 1.0
         standard = self._standard(belief, best) if efforts.any() else None
+        dt, away_m = (observation.frame.time_ns - belief.time_ns) * 1e-9, float(np.linalg.norm(belief.viewpoint))
+        spread = predicted_spread(self.model, self.localisation, dt, away_m)
         stepped = {}
         for c in np.flatnonzero(awake):
-            effort = _Effort(int(counts[c]), bool(behind[c] > -_LIKELY), float(efforts[c]), standard)
+            effort = _Effort(int(counts[c]), bool(behind[c] > -_LIKELY), float(efforts[c]), standard, spread)
             stepped[int(c)] = self._step_class(belief, self.model.shapes[c], view, observation, around, effort)
         after = stepped[best]
         gained = after.log_evidence - depth.log_evidence if depth is not None and after is not None else 0.0
@@ -612,7 +617,7 @@ class Updater:
         rng = self._rng("filter.step", belief.object_id, observation, shape)
         starts = np.zeros((0, 4, 4))
         if own is not None:
-            starts = observation.frame.T_camera_world @ own.particles.best(3)
+            starts = observation.frame.T_camera_world @ own.particles.best(_STARTS if effort.likely else 1)
         if effort.search > 0.0:
             found = self.proposer.search(shape, view, observation, around, rng, effort.search)
             starts = np.concatenate([starts, found])
@@ -621,7 +626,7 @@ class Updater:
         if effort.search > 0.0 and effort.standard is not None and proposals is not None:
             own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
         change = _Change(
-            self._spread(observation, belief.time_ns, starts),
+            effort.spread,
             self._moved_odds(belief, shape, observation),
             around.supports,
         )
@@ -663,12 +668,6 @@ class Updater:
         n = self.model.config.filter.min_particles
         return ClassBelief(Particles(mode.draw(n, shape, rng), np.full(n, -np.log(n))), late)
 
-    def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
-        """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
-        dt = (observation.frame.time_ns - before_ns) * 1e-9
-        away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
-        return predicted_spread(self.model, self.localisation, dt, away)
-
     def _weigh(
         self,
         own: ClassBelief | None,
@@ -691,7 +690,8 @@ class Updater:
         # what is hardly possible isn't worth it
         if own is not None and change is not None and count > settings.min_particles:
             prior = filled(own.particles, change.spread, shape, rng)
-            count = sufficient(prior, count, shape)
+            # what may have been moved may be anywhere
+            count = count if np.isfinite(change.log_moved) else sufficient(prior, count, shape)
         n_proposed = round(share * count)
         if prior is not None and change is not None:
             drawn.append(predict(prior, count - n_proposed, change.spread, shape, rng))

@@ -417,19 +417,14 @@ class Proposer:
             known: n, (6, 6) where `_climb` has seen the score's shape.
         """
         if not probe:
-            unit, hessian, _ = self._axes(shape, view, poses)
-            return self._laplace(view.share * view.samples * hessian, unit)
-        out = np.empty((len(poses), 6, 6))
-        missing = np.array([covariance is None for covariance in known], dtype=np.bool_)
-        for n in np.flatnonzero(~missing):
-            out[n] = known[n]
-        if missing.any():
-            out[missing] = self._probed(shape, view, poses[missing])
-        return out
+            return self._laplace(view.share * view.samples * self._hessian(shape, view, poses), _unit(shape))
+        missing = [n for n, covariance in enumerate(known) if covariance is None]
+        probed = iter(self._probed(shape, view, poses[missing]) if missing else ())
+        return np.stack([next(probed) if covariance is None else covariance for covariance in known])
 
     def _probed(self, shape: Shape, view: View, poses: Array) -> Array:
         view = view.coarse()
-        unit, _, directions = self._axes(shape, view, poses)
+        unit, directions = self._axes(shape, view, poses)
         around = np.concatenate([poses, _ladder(poses, directions * unit).reshape(-1, 4, 4)])
         depth = self.score(shape, view, around)[1].log_ratio
         return self._covariance(view, depth[: len(poses)], depth[len(poses) :], directions * unit)
@@ -454,9 +449,10 @@ class Proposer:
         poses = poses.copy()
         score, scores = self.score(shape, view, poses)
         least, depth = 0.5 * scores.visible, scores.log_ratio.copy()
-        climbing, known = np.arange(len(poses)), {}
+        climbing = np.arange(len(poses))
+        known: dict[int, Array] = {}
         for _ in range(_CLIMBS):
-            unit, _, directions = self._axes(shape, view, poses[climbing])
+            unit, directions = self._axes(shape, view, poses[climbing])
             around = _ladder(poses[climbing], directions * unit).reshape(len(climbing), -1, 4, 4)
             there, scores = self.score(shape, view, around.reshape(-1, 4, 4))
             there_depth = scores.log_ratio.reshape(len(climbing), -1)
@@ -475,11 +471,14 @@ class Proposer:
                 break
         return poses, known
 
-    def _axes(self, shape: Shape, view: View, poses: Array) -> tuple[Array, Array, Array]:
-        """What turns rad into metres (6,), normal equations (n, 6, 6) and their axes (n, 6 directions, 6) so scaled."""
-        hessian = refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
-        unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
-        return unit, hessian, np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)
+    def _axes(self, shape: Shape, view: View, poses: Array) -> tuple[Array, Array]:
+        """What turns metres into rad (6,), and the normal equations' axes (n, 6 directions, 6) so scaled."""
+        unit = _unit(shape)
+        hessian = self._hessian(shape, view, poses)
+        return unit, np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)
+
+    def _hessian(self, shape: Shape, view: View, poses: Array) -> Array:
+        return refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
 
     def _laplace(self, hessian: Array, unit: Array) -> Array:
         sensor = self.model.config.sensor
@@ -519,6 +518,11 @@ def _worth(shape: Shape, seen_m: float) -> float:
     if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
         return _LITTLE
     return _FURNITURE if _large(shape) else 1.0
+
+
+def _unit(shape: Shape) -> Array:
+    """(6,) a tangent of as many metres at the surface."""
+    return np.repeat([1.0 / shape.radius_m, 1.0], 3)
 
 
 def _ladder(poses: Array, axes: Array) -> Array:
