@@ -144,8 +144,6 @@ class _Effort:
     """effort of a fresh search, as a share of the first one's; 0 = none"""
     standard: _Standard | None
     """what the poses that a search finds are held to, beside what is believed"""
-    spread: Spread
-    """of the prediction since its place was last in view"""
 
 
 @dataclass(frozen=True)
@@ -568,11 +566,9 @@ class Updater:
         if view.detection is not None and (named != best or lost):
             awake[named], efforts[named] = True, 1.0
         standard = self._standard(belief, best) if efforts.any() else None
-        dt, away_m = (observation.frame.time_ns - belief.time_ns) * 1e-9, float(np.linalg.norm(belief.viewpoint))
-        spread = predicted_spread(self.model, self.localisation, dt, away_m)
         stepped = {}
         for c in np.flatnonzero(awake):
-            effort = _Effort(int(counts[c]), bool(behind[c] > -_LIKELY), float(efforts[c]), standard, spread)
+            effort = _Effort(int(counts[c]), bool(behind[c] > -_LIKELY), float(efforts[c]), standard)
             stepped[int(c)] = self._step_class(belief, self.model.shapes[c], view, observation, around, effort)
         after = stepped[best]
         gained = after.log_evidence - depth.log_evidence if depth is not None and after is not None else 0.0
@@ -626,7 +622,7 @@ class Updater:
         if effort.search > 0.0 and effort.standard is not None and proposals is not None:
             own = self._reconsider(belief, shape, own, proposals, effort.standard, rng)
         change = _Change(
-            effort.spread,
+            self._spread(observation, belief.time_ns, starts),
             self._moved_odds(belief, shape, observation),
             around.supports,
         )
@@ -667,6 +663,12 @@ class Updater:
             return own
         n = self.model.config.filter.min_particles
         return ClassBelief(Particles(mode.draw(n, shape, rng), np.full(n, -np.log(n))), late)
+
+    def _spread(self, observation: Observation, before_ns: int, starts: Array) -> Spread:
+        """Sigma = Q dt, and the localisation's own error, which moves everything that the camera sees."""
+        dt = (observation.frame.time_ns - before_ns) * 1e-9
+        away = float(np.median(starts[:, 2, 3])) if len(starts) else 1.0
+        return predicted_spread(self.model, self.localisation, dt, away)
 
     def _weigh(
         self,

@@ -45,7 +45,7 @@ _DIMENSIONS = 6
 _NOTHING = 40.0  # nats: what is so far behind the largest adds nothing to a sum in float64
 _SUPPORT = 4  # times as many points hold a belief whose gaps were filled: they cost a prior, not a likelihood
 _CELL = (0.15, 0.01)  # rad, metres: sides of the cells that a belief's spread is counted in
-_DIVERGENCE = 0.05  # nats that the particles' histogram over cells is off by at most ...
+_DIVERGENCE = 0.02  # nats that the particles' histogram over cells is off by at most ...
 _SURE = 2.326  # ... with probability 0.99: its quantile of the normal distribution
 _LEAST_SHARE = 1.0 / 3.0  # of the configured particles: within a cell they still tell mean and covariance
 
