@@ -21,6 +21,7 @@ from ctmap_gtsam.filtering.particles import (
     modes_of,
     predict,
     predicted_log_density,
+    sufficient,
 )
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.landing import landing_log_density
@@ -42,6 +43,7 @@ Array = NDArray[np.float64]
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
 _DORMANT = (45.0, 0.25)  # nats behind the best class, and share of its evidence, beyond which a class sleeps
+_STARTS = 3  # heaviest particles that a likely class's modes are looked for from
 _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighed and searched for
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
 _LOCALISED = 3.0  # standard deviations of the localisation by which a pose may seem elsewhere in another view
@@ -611,7 +613,7 @@ class Updater:
         rng = self._rng("filter.step", belief.object_id, observation, shape)
         starts = np.zeros((0, 4, 4))
         if own is not None:
-            starts = observation.frame.T_camera_world @ own.particles.best(3)
+            starts = observation.frame.T_camera_world @ own.particles.best(_STARTS if effort.likely else 1)
         if effort.search > 0.0:
             found = self.proposer.search(shape, view, observation, around, rng, effort.search)
             starts = np.concatenate([starts, found])
@@ -685,13 +687,15 @@ class Updater:
             return None
         settings = self.model.config.filter
         share = 1.0 if own is None else settings.proposal_share if proposals is not None else 0.0
-        n_proposed = round(share * count)
         drawn = []
-        prior = None
-        if own is not None and change is not None:
-            # what is hardly possible isn't worth it
-            sure = count > settings.min_particles
-            prior = filled(own.particles, change.spread, shape, rng) if sure else own.particles
+        prior = None if own is None else own.particles
+        # what is hardly possible isn't worth it
+        if own is not None and change is not None and count > settings.min_particles:
+            prior = filled(own.particles, change.spread, shape, rng)
+            # what may have been moved may be anywhere
+            count = count if np.isfinite(change.log_moved) else sufficient(prior, count, shape)
+        n_proposed = round(share * count)
+        if prior is not None and change is not None:
             drawn.append(predict(prior, count - n_proposed, change.spread, shape, rng))
         if proposals is not None:
             drawn.append(proposals.draw(n_proposed, shape, rng))

@@ -44,6 +44,10 @@ _SPARSE = 2.0  # a kernel so much wider than the prediction closes gaps that the
 _DIMENSIONS = 6
 _NOTHING = 40.0  # nats: what is so far behind the largest adds nothing to a sum in float64
 _SUPPORT = 4  # times as many points hold a belief whose gaps were filled: they cost a prior, not a likelihood
+_CELL = (0.15, 0.01)  # rad, metres: sides of the cells that a belief's spread is counted in
+_DIVERGENCE = 0.02  # nats that the particles' histogram over cells is off by at most ...
+_SURE = 2.326  # ... with probability 0.99: its quantile of the normal distribution
+_LEAST_SHARE = 1.0 / 3.0  # of the configured particles: within a cell they still tell mean and covariance
 
 
 @dataclass(frozen=True)
@@ -245,6 +249,35 @@ def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Ge
         along = np.sqrt(1.0 - widths**2) * along + widths * deviations * normals[own]
         T[own] = retract(mode.T_world_centre, (along @ axes.T) * walk)
     return Particles(T, np.full(n, -np.log(n)))
+
+
+def sufficient(particles: Particles, most: int, shape: Shape) -> int:
+    """How many particles a belief needs: as many as tell its histogram over cells (Fox, KLD-sampling, IJRR 2003).
+
+    Cells are counted about the heaviest particle, so that what lies close together is in one.
+
+    Args:
+        particles: weighted.
+        most: the answer at most.
+        shape: their class.
+    """
+    rows = np.unique(systematic(particles.log_weight, most, 0.5))
+    away = symmetry.residual(particles.best(1)[0], particles.T_world_centre[rows], shape.symmetry)
+    cells = np.unique(np.round(away / np.repeat(_CELL, 3)).astype(np.int64), axis=0)
+    return int(np.clip(kld_bound(len(cells)), round(_LEAST_SHARE * most), most))
+
+
+def kld_bound(cells: int) -> int:
+    """Draws after which a histogram of so many occupied cells is near to what was drawn from.
+
+    By less than `_DIVERGENCE` in Kullback-Leibler divergence with probability 0.99: the chi-square quantile in the
+    approximation of Wilson and Hilferty (Fox, 2003, Equation 7).
+    """
+    if cells < 2:
+        return 1
+    freedom = cells - 1.0
+    third = 2.0 / (9.0 * freedom)
+    return math.ceil(freedom / (2.0 * _DIVERGENCE) * (1.0 - third + math.sqrt(third) * _SURE) ** 3)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ modes: the proposals of filter and smoother, which weigh them with the model.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,6 +155,9 @@ class Proposer:
     def score(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
         """log-likelihood ratio (K,) of poses (K, 4, 4), and the fused kernel's answer."""
         self.hypotheses_scored += len(T_camera_centre)
+        return self._scored(shape, view, T_camera_centre)
+
+    def _scored(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[Array, Scores]:
         scores = score_depth(
             shape.mesh,
             view.tile,
@@ -223,19 +227,20 @@ class Proposer:
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
         keep = self._distinct(shape, candidates, score, ways)
+        known: dict[int, Array] = {}
         if probe and view.detection is not None:
-            candidates = np.concatenate([self._climb(shape, view, candidates[keep]), candidates[keep]])
+            climbed, known = self._climb(shape, view, candidates[keep])
+            candidates = np.concatenate([climbed, candidates[keep]])
             score, scores = self.score(shape, view, candidates)
             keep = self._distinct(shape, candidates, score, ways)
         poses = candidates[keep]
-        covariance = self._shape_of_score(shape, view, poses, probe)
+        covariance = self._shape_of_score(shape, view, poses, probe, [known.get(row) for row in keep])
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
         return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
 
     def told(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[float, float]:
         """What depth and the detector say of one pose (4, 4), nats: for the ledger, and no hypothesis."""
-        score, scores = self.score(shape, view, T_camera_centre[None])
-        self.hypotheses_scored -= 1
+        score, scores = self._scored(shape, view, T_camera_centre[None])
         depth = float(view.share * self.model.kappa * scores.log_ratio[0])
         return depth, float(score[0]) - depth
 
@@ -397,56 +402,83 @@ class Proposer:
                 kept.append(rows[int(np.argmax(there))])
         return sorted(kept, key=lambda row: (-score[row], row))
 
-    def _shape_of_score(self, shape: Shape, view: View, poses: Array, probe: bool) -> Array:
+    def _shape_of_score(
+        self, shape: Shape, view: View, poses: Array, probe: bool, known: Sequence[Array | None]
+    ) -> Array:
         """Covariances (n, 6, 6): how far the score lets a pose go along the axes of its normal equations.
 
         The normal equations alone are falsely certain: where the score is flat, faces that happen to be hit still pull.
-        """
-        unit, hessian, directions = self._axes(shape, view, poses)
-        if not probe:
-            return self._laplace(view.share * view.samples * hessian, unit)
-        view = view.coarse()
-        around = np.concatenate([poses, _ladder(poses, directions * unit).reshape(-1, 4, 4)])
-        depth = view.samples * score_depth(shape.mesh, view.tile, around, self.model.depth_parameters, 0.0).log_ratio
-        self.hypotheses_scored += len(around)
-        here, there = depth[: len(poses)], depth[len(poses) :].reshape(len(poses), 6, -1)
-        drop = view.share * self.model.kappa * (here[:, None, None] - there)
-        sigma = _widths(drop.reshape(len(poses), 6, 2, -1))
-        scaled = directions * unit
-        return np.asarray(np.einsum("nd,ndi,ndj->nij", sigma**2, scaled, scaled))
 
-    def _climb(self, shape: Shape, view: View, poses: Array) -> Array:
+        Args:
+            shape: the class.
+            view: where to look.
+            poses: (n, 4, 4).
+            probe: whether to look, or go by the normal equations.
+            known: n, (6, 6) where `_climb` has seen the score's shape.
+        """
+        if not probe:
+            return self._laplace(view.share * view.samples * self._hessian(shape, view, poses), _unit(shape))
+        missing = [n for n, covariance in enumerate(known) if covariance is None]
+        probed = iter(self._probed(shape, view, poses[missing]) if missing else ())
+        return np.stack([next(probed) if covariance is None else covariance for covariance in known])
+
+    def _probed(self, shape: Shape, view: View, poses: Array) -> Array:
+        view = view.coarse()
+        unit, directions = self._axes(shape, view, poses)
+        around = np.concatenate([poses, _ladder(poses, directions * unit).reshape(-1, 4, 4)])
+        depth = self.score(shape, view, around)[1].log_ratio
+        return self._covariance(view, depth[: len(poses)], depth[len(poses) :], directions * unit)
+
+    def _covariance(self, view: View, here: Array, there: Array, axes: Array) -> Array:
+        """Covariances (n, 6, 6) by the depth's log ratio at poses (n,) and on their ladders (n 12 steps,)."""
+        fall = here[:, None, None, None] - there.reshape(len(here), 6, 2, len(_LADDER_M))
+        sigma = _widths(view.share * self.model.kappa * fall)
+        return np.asarray(np.einsum("nd,ndi,ndj->nij", sigma**2, axes, axes))
+
+    def _climb(self, shape: Shape, view: View, poses: Array) -> tuple[Array, dict[int, Array]]:
         """Poses (n, 4, 4) moved along their axes to where the score is larger, as long as that gains anything.
 
         Registration doesn't move a flat face along itself: what tells where its edges are is the silhouette. Hiding
         behind or under something is no gain: at least half of what was to be seen stays so. Not for what the detector
         doesn't see: something that was taken away would climb into hiding.
+
+        Returns:
+            The poses, and the covariance (6, 6) of each row that was looked around from and stayed.
         """
         view = view.coarse()
         poses = poses.copy()
         score, scores = self.score(shape, view, poses)
-        least = 0.5 * scores.visible
+        least, depth = 0.5 * scores.visible, scores.log_ratio.copy()
         climbing = np.arange(len(poses))
+        known: dict[int, Array] = {}
         for _ in range(_CLIMBS):
-            unit, _, directions = self._axes(shape, view, poses[climbing])
+            unit, directions = self._axes(shape, view, poses[climbing])
             around = _ladder(poses[climbing], directions * unit).reshape(len(climbing), -1, 4, 4)
             there, scores = self.score(shape, view, around.reshape(-1, 4, 4))
+            there_depth = scores.log_ratio.reshape(len(climbing), -1)
             in_sight = scores.visible.reshape(len(climbing), -1) >= least[climbing, None]
             there = np.where(in_sight, there.reshape(len(climbing), -1), -np.inf)
             best = np.argmax(there, axis=1)
             gains = there[np.arange(len(climbing)), best] > score[climbing] + _CLIMB_NATS
+            top = climbing[~gains]
+            shapes = self._covariance(view, depth[top], there_depth[~gains], (directions * unit)[~gains])
+            known |= dict(zip(top.tolist(), shapes, strict=True))
             poses[climbing[gains]] = around[gains, best[gains]]
             score[climbing[gains]] = there[gains, best[gains]]
+            depth[climbing[gains]] = there_depth[gains, best[gains]]
             climbing = climbing[gains]
             if not len(climbing):
                 break
-        return poses
+        return poses, known
 
-    def _axes(self, shape: Shape, view: View, poses: Array) -> tuple[Array, Array, Array]:
-        """What turns rad into metres (6,), normal equations (n, 6, 6) and their axes (n, 6 directions, 6) so scaled."""
-        hessian = refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
-        unit = np.repeat([1.0 / shape.radius_m, 1.0], 3)
-        return unit, hessian, np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)
+    def _axes(self, shape: Shape, view: View, poses: Array) -> tuple[Array, Array]:
+        """What turns metres into rad (6,), and the normal equations' axes (n, 6 directions, 6) so scaled."""
+        unit = _unit(shape)
+        hessian = self._hessian(shape, view, poses)
+        return unit, np.linalg.eigh(hessian * unit[:, None] * unit)[1].swapaxes(-1, -2)
+
+    def _hessian(self, shape: Shape, view: View, poses: Array) -> Array:
+        return refine_on_depth(shape.mesh, shape.normals, view.tile, poses, self._fine[:1])[1]
 
     def _laplace(self, hessian: Array, unit: Array) -> Array:
         sensor = self.model.config.sensor
@@ -486,6 +518,11 @@ def _worth(shape: Shape, seen_m: float) -> float:
     if seen_m < _UNLIKE * np.hypot(sides[0], sides[1]) or seen_m * _UNLIKE > 2.0 * shape.reach_m:
         return _LITTLE
     return _FURNITURE if _large(shape) else 1.0
+
+
+def _unit(shape: Shape) -> Array:
+    """(6,) a tangent of as many metres at the surface."""
+    return np.repeat([1.0 / shape.radius_m, 1.0], 3)
 
 
 def _ladder(poses: Array, axes: Array) -> Array:

@@ -189,9 +189,7 @@ class Thing:
                 return None
             stage, state = self.stages[c][i], self.posteriors[c].path[i]
             return Held(i, stage.T_world_centre[state], stage.covariance[state], smoothed=False)
-        measured = sorted(self.poses)
-        before = [k for k in measured if k <= keyframe]
-        nearest = before[-1] if before else measured[0]
+        nearest = max((k for k in self.poses if k <= keyframe), default=min(self.poses))
         return Held(self.keyframes.index(nearest), *self.poses[nearest], smoothed=True)
 
     def shares(self, c: int, i: int) -> Array:

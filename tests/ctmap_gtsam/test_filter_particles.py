@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctmap_gtsam.filtering.belief import Updater
-from ctmap_gtsam.filtering.particles import Gaussians, Particles, Spread, predict, predicted_log_density
+from ctmap_gtsam.filtering.particles import (
+    Gaussians,
+    Particles,
+    Spread,
+    kld_bound,
+    predict,
+    predicted_log_density,
+    sufficient,
+)
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.frontend.surroundings import Surroundings
@@ -103,7 +111,7 @@ def test_the_heaviest_come_first_and_ties_in_order():
 @pytest.mark.parametrize("share", [0.5, 0.01], ids=["half proposed", "almost all predicted"])
 def test_where_all_is_gaussian_the_filter_is_kalmans(share):
     """Law 7 of the model: means, covariances, evidence; irregular times, missing measurements, random covariances."""
-    n = 3000
+    n = 9000  # at most: a third where all is in one place
     config = config_of(
         f"filter.particles={n}",
         f"filter.proposal_share={share}",
@@ -215,3 +223,41 @@ def test_no_measurement_takes_a_thing_farther_than_it_can_be_pushed(jump):
     away = after.classes[0].particles.T_world_centre[:, 0, 3]
     weights = np.exp(after.classes[0].particles.log_weight)
     assert weights[np.abs(away) > model.config.prediction.region_radius_m].sum() < 1e-12
+
+
+@pytest.mark.parametrize("cells", [2, 5, 20, 100])
+def test_so_many_draws_tell_a_histogram_over_cells(cells):
+    """Less than 0.02 nats off with probability 0.99, whatever the histogram; 2 % of 4,000 trials are beyond chance."""
+    rng = np.random.default_rng(cells)
+    p = rng.dirichlet(np.full(cells, 20.0))
+    q = rng.multinomial(kld_bound(cells), p, size=4000) / kld_bound(cells)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.where(q > 0.0, q * np.log(q / p), 0.0).sum(axis=-1)
+    assert (off < 0.02).mean() > 0.98
+
+
+def test_more_cells_need_more_draws():
+    bounds = [kld_bound(cells) for cells in range(1, 200)]
+    assert bounds == sorted(bounds)
+
+
+@each_shape
+@settings(max_examples=8)
+@given(SEEDS)
+def test_what_a_belief_needs_hangs_neither_on_the_image_nor_on_the_world(shape, seed):
+    rng = np.random.default_rng(seed)
+    particles, frame = cloud(rng, shape, n=60, sigma=(0.2, 0.02), images=False), se3.exp(rng.normal(size=6))
+    T = frame @ particles.T_world_centre
+    images = np.stack([pose @ random_image(rng, shape.symmetry) for pose in T])
+    there = sufficient(Particles(T, particles.log_weight), 300, shape)
+    assert there == sufficient(particles, 300, shape)
+    # what lies on a cell's edge may go either way, and the heaviest is written as another image of itself
+    assert sufficient(Particles(images, particles.log_weight), 300, shape) == pytest.approx(there, rel=0.35)
+
+
+@settings(max_examples=8)
+@given(SEEDS)
+def test_a_belief_in_one_place_needs_a_third_and_one_all_over_needs_all(seed):
+    rng = np.random.default_rng(seed)
+    assert sufficient(cloud(rng, MUG, n=300, sigma=(0.005, 3e-4)), 300, MUG) == 100
+    assert sufficient(cloud(rng, MUG, n=300, sigma=(1.0, 0.1)), 300, MUG) == 300

@@ -180,6 +180,14 @@ def test_no_mode_scores_less_than_its_start():
     np.testing.assert_allclose(proposer.model.kappa * scores.log_ratio, modes.depth_log_ratio)
 
 
+def test_what_a_climb_saw_of_a_mode_is_what_a_look_at_it_sees():
+    proposer, shape, view, _, T = scene("mug")
+    climbed, known = T[None], {}
+    while not known:
+        climbed, known = proposer._climb(shape, view, climbed)
+    np.testing.assert_allclose(known[0], proposer._probed(shape, view, climbed)[0], rtol=1e-6, atol=1e-14)
+
+
 def test_the_same_starts_many_times_and_in_any_order_are_the_same_starts():
     proposer, shape, view, _, T = scene("mug")
     rng = np.random.default_rng(4)
