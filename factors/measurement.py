@@ -200,55 +200,19 @@ def pixel_ratio(z, rendered, without, parameters):
         return 1.0
     if z > rendered + reach:
         return pixel_past(without, parameters)
+    _, _, outlier, inverse_range, occluder, _ = parameters
     clean, inverse_density, background, variance, inverse_depth, before = without
-    return _ratio_near(
-        z, rendered, clean, inverse_density, background, variance, inverse_depth, before, reach, parameters
-    )
-
-
-@numba.njit(**_KERNEL, inline="always")
-def _ratio_near(z, rendered, clean, inverse_density, background, variance, inverse_depth, before, reach, parameters):
-    """`pixel_ratio` of a pixel measured within reach of the object: no branches, so that loops of it are vectorised."""
-    outlier, inverse_range, occluder = parameters[2], parameters[3], parameters[4]
     sigma = reach * (1.0 / _CUT)
     inverse_sigma = 1.0 / sigma
     # P_b(z' < r): something stands before the object, or the background does
-    gap = (rendered - background) / math.sqrt(variance + sigma * sigma)
-    clear = (1.0 - occluder) * _below(gap, _bell(gap))
     hidden = (occluder if background > 0.0 else 1.0) * min(1.0, rendered * inverse_depth)
-    hidden += clear if rendered > before else 0.0
+    if rendered > before:
+        gap = (rendered - background) / math.sqrt(variance + sigma * sigma)
+        hidden += (1.0 - occluder) * _below(gap, _bell(gap))
     x = (z - rendered) * inverse_sigma
     bell = _bell(x)
     surface = clean * _below(-x, bell) + (1.0 - hidden) * _INV_SQRT_2PI * inverse_sigma * bell
     return ((1.0 - outlier) * surface + outlier * inverse_range) * inverse_density
-
-
-@numba.njit(**_KERNEL)
-def near_ratios(near, n, parameters, out):
-    """`pixel_ratio` of n pixels measured within reach of the object, for kernels to multiply.
-
-    Args:
-        near: (8, >= n): measured depth, the object's depth, and the six of `pixel_without_object`.
-        n: how many.
-        parameters: `DepthModel.parameters()`.
-        out: (>= n,)
-    """
-    z, rendered, clean, inverse_density = near[0], near[1], near[2], near[3]
-    background, variance, inverse_depth, before = near[4], near[5], near[6], near[7]
-    for i in range(n):
-        reach = pixel_reach(rendered[i], parameters)
-        out[i] = _ratio_near(
-            z[i],
-            rendered[i],
-            clean[i],
-            inverse_density[i],
-            background[i],
-            variance[i],
-            inverse_depth[i],
-            before[i],
-            reach,
-            parameters,
-        )
 
 
 @numba.njit(**_KERNEL)

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.measurement import near_ratios, pixel_past, pixel_reach, pixel_without_object
+from factors.measurement import pixel_past, pixel_ratio, pixel_reach, pixel_without_object
 from sequences.camera import Camera
 from sequences.catalogue import Mesh
 from sequences.geometry import Plane, plane_depth
@@ -124,14 +124,14 @@ def _extent(projected, height, width):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near, ratios, out):
+def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out):
     """Score one tile (h, w), rendered within `extent`, on measurements (h w,).
 
     `out` is (7,): log ratio, covered, visible, box in the tile.
-    `near` (8, h w + 1) and `ratios` (h w + 1,) are to work in.
+    `near_pixel` and `near_depth` are (h w + 1,) to work in.
     """
     height, width = inverse_depth.shape
-    n_near, covered, visible = np.uintp(0), 0, 0
+    near, covered, visible = np.uintp(0), 0, 0
     total = 0.0
     u0, v0, u1, v1 = width, height, -1, -1
     # without branches that pixels would take at random; those near the surface are kept for a loop of their own
@@ -146,20 +146,19 @@ def _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, ne
             gap, reach = z - rendered, pixel_reach(rendered, parameters)
             measured = z > 0.0
             total += past[p] if gap > reach else 0.0
-            near[0, n_near], near[1, n_near] = z, rendered
-            for i in range(6):
-                near[2 + i, n_near] = without[p, i]
-            n_near += np.uintp(measured & (abs(gap) <= reach))
+            near_pixel[near], near_depth[near] = p, rendered
+            near += np.uintp(measured & (abs(gap) <= reach))
             seen = measured & (gap > -margin)
             covered += 1
             visible += seen
             first, last = min(first, u if seen else width), max(last, u if seen else -1)
         u0, u1 = min(u0, first), max(u1, last)
         v0, v1 = min(v0, v if last >= 0 else height), v if last >= 0 else v1
-    near_ratios(near, n_near, parameters, ratios)
     product = 1.0
-    for i in range(n_near):
-        product *= ratios[i]
+    for i in range(near):
+        p = np.uintp(near_pixel[i])
+        shared = (without[p, 0], without[p, 1], without[p, 2], without[p, 3], without[p, 4], without[p, 5])
+        product *= pixel_ratio(zs[p], near_depth[i], shared, parameters)
         if not _SMALL < product < _LARGE:  # one logarithm for many pixels
             total += math.log(product)
             product = 1.0
@@ -174,13 +173,13 @@ def _score(vertices, faces, solid, poses, camera, depth, without, past, paramete
     for part in numba.prange((len(poses) + PART - 1) // PART):
         projected, inverse_depth = np.empty(vertices.shape), np.empty(depth.shape)
         chosen = np.empty((2, len(faces) + 1), np.int32)
-        near, ratios = np.empty((8, zs.size + 1)), np.empty(zs.size + 1)
+        near_pixel, near_depth = np.empty(zs.size + 1, np.uint32), np.empty(zs.size + 1)
         for k in range(part * PART, min(part * PART + PART, len(poses))):
             project(vertices, poses[k], camera, projected)
             extent = _extent(projected, depth.shape[0], depth.shape[1])
             inverse_depth[extent[0] : extent[1], extent[2] : extent[3]] = 0.0
             rasterise(projected, faces, solid, chosen, inverse_depth, None)
-            _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near, ratios, out[k])
+            _score_tile(inverse_depth, extent, zs, without, past, parameters, margin, near_pixel, near_depth, out[k])
             # samples stand for step x step pixels
             for i, at, half in ((3, x, -step / 2.0), (4, y, -step / 2.0), (5, x, step / 2.0), (6, y, step / 2.0)):
                 out[k, i] = out[k, i] * step + at + half if out[k, 2] > 0.0 else np.nan

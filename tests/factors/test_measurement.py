@@ -74,18 +74,6 @@ def test_depth_broadcasts_and_is_the_scalar_kernel():
     assert ratios[2, 1] == depth_log_ratio(0.8, 0.8, 0.9)
 
 
-@given(SEEDS)
-def test_many_pixels_at_once_say_what_they_say_one_by_one(seed):
-    rng, p = np.random.default_rng(seed), MODEL.parameters()
-    rendered = rng.uniform(0.3, 4.0, size=50)
-    z = rendered + rng.uniform(-1.0, 1.0, size=50) * measurement.pixel_reach(rendered, p)
-    behind = rendered + rng.choice([0.0, 0.01, 0.5, -0.01], size=50)
-    shared = [measurement.pixel_without_object(*pair, p) for pair in zip(z, behind, strict=True)]
-    out = np.empty(50)
-    measurement.near_ratios(np.stack([z, rendered, *np.transpose(shared)]), 50, p, out)
-    np.testing.assert_allclose(np.log(out), depth_log_ratio(z, rendered, behind), atol=1e-12)
-
-
 def test_white_noise_is_not_correlated():
     noise = np.random.default_rng(0).standard_normal((6, 60, 80))
     assert measurement.correlated_pixels(noise) == pytest.approx(1.0, abs=0.25)
