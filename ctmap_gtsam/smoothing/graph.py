@@ -383,7 +383,7 @@ def covariances(linear: Any, keys: Sequence[int]) -> dict[int, Array]:
     tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
     del linear
     out: dict[int, Array] = {}
-    for clique, own in _branches(tree, keys):
+    for clique, own in branches(tree, keys):
         for key in own:
             out[key] = tree.marginalCovariance(key)
         if clique is not None:
@@ -391,7 +391,7 @@ def covariances(linear: Any, keys: Sequence[int]) -> dict[int, Array]:
     return out
 
 
-def _branches(tree: Any, keys: Sequence[int]) -> Iterator[tuple[Any | None, list[int]]]:
+def branches(tree: Any, keys: Sequence[int]) -> Iterator[tuple[Any | None, list[int]]]:
     """The cliques from each root down, and which keys are theirs; a clique without keys where its branch has ended."""
     cliques: dict[int, Any] = {}
     own: dict[int, list[int]] = {}
