@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -107,10 +108,7 @@ class Thing:
     @property
     def anchor(self) -> Array | None:
         """A smoothed pose (4, 4) in the middle of its life; None where it has none."""
-        if not self.poses:
-            return None
-        keyframes = sorted(self.poses)
-        return self.poses[keyframes[len(keyframes) // 2]][0]
+        return self.poses[self._posed[len(self._posed) // 2]][0] if self.poses else None
 
     def possible(self, model: Model) -> list[int]:
         """Classes worth another round."""
@@ -125,18 +123,33 @@ class Thing:
     def pose_near(self, c: int, keyframe: int) -> Array | None:
         """(1, 4, 4) best guess of class c at a keyframe: smoothed, or the trellis's nearest mode."""
         if c == self.best_class and self.poses:
-            return self.poses[_nearest(sorted(self.poses), keyframe)][0][None]
+            return self.poses[self._posed[_nearest(self._posed, keyframe)]][0][None]
         i = self._measured_near(c, keyframe)
         return None if i is None else self.stages[c][i].T_world_centre[self.posteriors[c].path[i]][None]
 
     def _measured_near(self, c: int, keyframe: int) -> int | None:
         """The view nearest in time in which the best path of class c goes through a mode."""
-        stages = self.stages.get(c)
-        if stages is None:
-            return None
-        path = self.posteriors[c].path
-        there = [i for i, s in enumerate(stages) if path[i] < len(s.log_evidence)]
-        return min(there, key=lambda i: (abs(stages[i].keyframe - keyframe), i)) if there else None
+        there = self._measured.get(c)
+        return there[1][_nearest(there[0], keyframe)] if there is not None and there[0] else None
+
+    @cached_property
+    def _posed(self) -> tuple[int, ...]:
+        """Keyframes that have a smoothed pose, ascending."""
+        return tuple(sorted(self.poses))
+
+    @cached_property
+    def _measured(self) -> dict[int, tuple[list[int], list[int]]]:
+        """Class index -> keyframes in which its best path goes through a mode, ascending, and which views they are."""
+        out = {}
+        for c, stages in self.stages.items():
+            path = self.posteriors[c].path
+            views = [i for i, stage in enumerate(stages) if path[i] < len(stage.log_evidence)]
+            out[c] = [stages[i].keyframe for i in views], views
+        return out
+
+    def view_at(self, keyframe: int) -> int:
+        """Position in `keyframes` of one that is among them."""
+        return bisect_left(self.keyframes, keyframe)
 
     def presence_at(self, keyframe: int) -> float:
         """P(present | it exists) at any keyframe: that of the last one in view, or of the first before that."""
@@ -189,8 +202,8 @@ class Thing:
                 return None
             stage, state = self.stages[c][i], self.posteriors[c].path[i]
             return Held(i, stage.T_world_centre[state], stage.covariance[state], smoothed=False)
-        nearest = max((k for k in self.poses if k <= keyframe), default=min(self.poses))
-        return Held(self.keyframes.index(nearest), *self.poses[nearest], smoothed=True)
+        nearest = self._posed[max(bisect_right(self._posed, keyframe) - 1, 0)]
+        return Held(self.view_at(nearest), *self.poses[nearest], smoothed=True)
 
     def shares(self, c: int, i: int) -> Array:
         """(n,) of the modes of class c at its i-th view, given that it is there: their sum is 1.
@@ -204,13 +217,36 @@ class Thing:
         total = shares.sum()
         return shares / total if total > 0.0 else shares
 
+    def modes_at(self, c: int, keyframe: int) -> Array:
+        """(n, 4, 4) T_world_centre of the modes of class c at a keyframe; none where it wasn't in view."""
+        i = self.view_at(keyframe)
+        if c not in self.stages or i == len(self.keyframes) or self.keyframes[i] != keyframe:
+            return np.zeros((0, 4, 4))
+        return self.stages[c][i].T_world_centre
+
+    def to_start_from(self) -> Thing:
+        """The same without what only its graph and the estimate ask for: sightings' modes, and stages' covariances.
+
+        A map holds them for every object, class and keyframe, and the next round gathers as many again.
+        """
+        unseen = np.zeros((0, 6, 6))
+        return replace(
+            self,
+            sightings={k: replace(s, modes=(), context=()) for k, s in self.sightings.items()},
+            stages={c: tuple(replace(s, covariance=unseen) for s in stages) for c, stages in self.stages.items()},
+        )
+
     def with_poses(self, poses: Mapping[int, tuple[Array, Array]]) -> Thing:
         """The same with smoothed poses."""
         return replace(self, poses=dict(poses))
 
 
-def _nearest(sorted_keyframes: list[int], keyframe: int) -> int:
-    return min(sorted_keyframes, key=lambda k: (abs(k - keyframe), k))
+def _nearest(keyframes: Sequence[int], keyframe: int) -> int:
+    """Position of the nearest of ascending keyframes, at least one; the earlier of two."""
+    after = bisect_left(keyframes, keyframe)
+    if after in (0, len(keyframes)):
+        return min(after, len(keyframes) - 1)
+    return after - (keyframe - keyframes[after - 1] <= keyframes[after] - keyframe)
 
 
 def judge(

@@ -13,7 +13,7 @@ Whatever an object is at a keyframe (class, box, joined to one that vanished) is
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -273,14 +273,21 @@ class _Walk:
         thing = self.objects[i].thing
         own = None
         if thing is not None:
-            known = self.objects[i].sightings[max(self.objects[i].sightings)]
-            own = wanted_of(thing, keyframe, self.recording, self.model, known)
+            latest = self.objects[i].sightings[max(self.objects[i].sightings)]
+            own = wanted_of(thing, keyframe, self.model, self._modes_of(latest))
         if own is None:
             best = b.best_class
             return Wanted(self.objects[i].poses, (best, b.poses[best][0]), careful(b.poses, b.class_probability))
         starts = {c: np.concatenate([T, b.poses[c]]) if c in b.poses else T for c, T in own.starts.items()}
         where = (b.best_class, b.poses[b.best_class][0]) if self._elsewhere(i, keyframe, b) else own.expected
         return replace(own, starts={**b.poses, **starts}, expected=where)
+
+    def _modes_of(self, sighting: Sighting | None) -> Callable[[int], Array]:
+        """Class index -> (n, 4, 4) T_world_centre of a sighting's modes."""
+        if sighting is None:
+            return lambda c: np.zeros((0, 4, 4))
+        T_world_camera = self.recording.T_world_camera(sighting.keyframe)
+        return lambda c: in_world(sighting, c, T_world_camera)
 
     def _look_again(self, o: _Object, fresh: Mapping[int, Array], probed: frozenset[int]) -> None:
         """Try poses on all looks that are kept."""
@@ -306,7 +313,7 @@ class _Walk:
     def _wish_at_first(self, o: _Object, keyframe: int, b: Believed, known: Mapping[int, Sighting]) -> Wanted:
         own = None
         if o.thing is not None:
-            own = wanted_of(o.thing, keyframe, self.recording, self.model, known.get(keyframe))
+            own = wanted_of(o.thing, keyframe, self.model, self._modes_of(known.get(keyframe)))
         best = b.best_class
         return own or Wanted(o.poses, (best, b.poses[best][0]), careful(b.poses, b.class_probability))
 

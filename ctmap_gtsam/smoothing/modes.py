@@ -26,6 +26,8 @@ from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
 
+_NOWHERE = np.zeros(0)  # context of no modes: one array for all classes, objects and keyframes
+
 Boxes = Mapping[int, Detection]
 """keyframe -> the detection that is taken for an object there"""
 
@@ -211,7 +213,7 @@ def sight(at: Look, proposer: Proposer, wish: Wanted, known: Sighting | None = N
         starts = wish.starts.get(shape.index)
         if starts is None or not len(starts):
             modes.append(None if known is None else known.modes[shape.index])
-            context.append(np.zeros(0) if known is None else known.context[shape.index])
+            context.append(_NOWHERE if known is None else known.context[shape.index])
             continue
         careful = shape.index in wish.careful
         found = proposer.modes(shape, at.view, T_camera_world @ starts, probe=careful, ways_round=careful)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected
 from ctmap_gtsam.smoothing.belief import Thing
 from ctmap_gtsam.smoothing.graph import Camera, Measured
-from ctmap_gtsam.smoothing.modes import Recording, Sighting, Wanted, in_world
+from ctmap_gtsam.smoothing.modes import Recording, Wanted
 
 Array = NDArray[np.float64]
 
@@ -27,24 +27,21 @@ def expected_of(thing: Thing, keyframe: int) -> Expected | None:
     return Expected(thing.best_class, pose[0], thing.class_probability, thing.solid * thing.presence_at(keyframe))
 
 
-def wanted_of(thing: Thing, keyframe: int, recording: Recording, model: Model, known: Sighting | None) -> Wanted | None:
+def wanted_of(thing: Thing, keyframe: int, model: Model, known: Callable[[int], Array]) -> Wanted | None:
     """What is believed of an object at a keyframe, and the modes of a sighting; None where it has no pose.
 
     Args:
         thing: the object.
         keyframe: where it is looked for.
-        recording: the run.
         model: says which classes are possible.
-        known: the sighting whose modes are tried, too.
+        known: class index -> (n, 4, 4) T_world_centre of a sighting's modes, which are tried, too.
     """
     best = thing.best_class
     starts = {}
     for c in thing.possible(model):
         # what a keyframe has settled on may be wrong: the middle of its life has another say
         near = [thing.pose_near(c, keyframe), thing.anchor[None] if c == best and thing.anchor is not None else None]
-        if known is not None:
-            near.append(in_world(known, c, recording.T_world_camera(known.keyframe)))
-        starts[c] = np.concatenate([n for n in near if n is not None] or [np.zeros((0, 4, 4))])
+        starts[c] = np.concatenate([*(n for n in near if n is not None), known(c)])
     pose = thing.pose_near(best, keyframe)
     return None if pose is None else Wanted(starts, (best, pose[0]), frozenset(thing.likely()))
 

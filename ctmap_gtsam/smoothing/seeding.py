@@ -8,8 +8,10 @@ past would be counted twice.
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,9 +80,13 @@ class Seed:
 
     def _nearest(self, c: int, keyframe: int) -> Array:
         """What was believed of a class at a keyframe, or next to it, the past first."""
-        keyframes = sorted(self.believed[c])
-        before = [k for k in keyframes if k <= keyframe]
-        return self.believed[c][before[-1] if before else keyframes[0]]
+        keyframes = self._keyframes[c]
+        return self.believed[c][keyframes[max(bisect_right(keyframes, keyframe) - 1, 0)]]
+
+    @cached_property
+    def _keyframes(self) -> dict[int, list[int]]:
+        """Class index -> keyframes at which something was believed of it, ascending."""
+        return {c: sorted(then) for c, then in self.believed.items()}
 
 
 def most_probable(poses: Mapping[int, Array], probability: Array) -> int:

@@ -68,6 +68,10 @@ class Map:
     company: Mapping[int, Company]
     """visit -> who was moved together before it, by the round before"""
 
+    def to_start_from(self) -> Map:
+        """The same without what the next round doesn't ask for."""
+        return replace(self, things={i: thing.to_start_from() for i, thing in self.things.items()})
+
 
 @dataclass(frozen=True)
 class Rounds:
@@ -129,6 +133,7 @@ def smooth_run(
         state = _stepped(first, [], False, proposer, checkpoint)
     proposer.hypotheses_scored = state.hypotheses_scored
     while not _enough(state, config):
+        state = replace(state, current=state.current.to_start_from())
         following = _next_round(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
         settled = _settled(state.current, following, model)
         state = _stepped(following, state.energies, settled, proposer, checkpoint)
@@ -204,7 +209,7 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
 
     def wanted(i: int, k: int) -> Wanted | None:
         thing = current.things[i]
-        return wanted_of(thing, k, recording, model, thing.sightings.get(k))
+        return wanted_of(thing, k, model, lambda c: thing.modes_at(c, k))
 
     def around(k: int) -> Surroundings:
         return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces, company[visits[k]])

@@ -145,7 +145,7 @@ def _share_in_view(shape: Shape, T: Array, T_world_camera: Array, recording: Rec
 
 def _write_class(tables: Tables, row: int, k: int, thing: Thing, c: int, recording: Recording, model: Model) -> None:
     """The modes of a class that is still possible, as its own trellis weighs them."""
-    i = thing.keyframes.index(k)
+    i = thing.view_at(k)
     for mode in _modes(thing, c, i, recording, model):
         if mode.share >= _REPORTED:
             _write_mode(tables, row, k, model.shapes[c], mode)
@@ -206,7 +206,7 @@ def free_axes(shape: Shape, covariance: Array) -> Array:
 
 def _write_ledger(tables: Tables, row: int, k: int, thing: Thing, model: Model) -> None:
     """What the trellis weighs at the states that the best path goes through."""
-    c, i = thing.reported_class, thing.keyframes.index(k)
+    c, i = thing.reported_class, thing.view_at(k)
     tables.note(row, k, "clutter", -thing.sightings[k].log_clutter)
     if i:
         tables.note(row, k, "persistence", _log_persistence(thing, c, i, model))
@@ -255,7 +255,7 @@ def _write_move(
     tables: Tables, row: int, k: int, thing: Thing, recording: Recording, significant_period_s: float
 ) -> None:
     """A line for the gap before a view if it is long enough to hold a move, or probably held one."""
-    i = thing.keyframes.index(k) - 1
+    i = thing.view_at(k) - 1
     if i < 0:
         return
     gap = (thing.keyframes[i], k)

@@ -85,6 +85,7 @@ def test_figures_are_of_what_was_measured(monkeypatch, module):
     assert figures[f"{name}.seconds_per_keyframe_40"] == pytest.approx(factor * 13.0 / 40)
     assert figures[f"{name}.seconds_long_over_short"] == pytest.approx((13.0 / 40) / (11.0 / 20))
     assert figures[f"{name}.memory_long_over_short"] == pytest.approx(140.0 / 120.0)
+    assert figures[f"{name}.kb_per_keyframe"] == pytest.approx(1024.0)
     if name == "smooth":
         assert figures["smooth.over_filter_1_objects"] == pytest.approx(2.0)
     else:

@@ -17,8 +17,9 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
         `filter.keyframes_per_s_N_objects`, of keyframes after all objects were begun, and `filter.start_s_N_objects`,
         seconds until then; `filter.keyframes_per_s_M_particles`; `filter.seconds_per_keyframe_L` and
         `filter.peak_mb_L` of runs of two lengths, all keyframes included, with their ratios
-        `filter.seconds_long_over_short` and `filter.memory_long_over_short`; `filter.late_over_early`, seconds a
-        keyframe at the end of the long run over those of as many keyframes near its beginning.
+        `filter.seconds_long_over_short` and `filter.memory_long_over_short`, and `filter.kb_per_keyframe`, by which the
+        memory grows; `filter.late_over_early`, seconds a keyframe at the end of the long run over those of as many
+        keyframes near its beginning.
     """
     figures: dict[str, float] = {}
     objects = (*sizes.objects, sizes.length_objects)

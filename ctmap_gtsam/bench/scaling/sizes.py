@@ -50,10 +50,15 @@ def loops(objects: Sequence[int], frames: int, seed: int, progress: Progress) ->
 def by_length(
     name: str, short: tuple[float, float], long: tuple[float, float], lengths: tuple[int, int]
 ) -> dict[str, float]:
-    """Figures of a short and of a long run, each (seconds a keyframe, megabytes), and their ratios."""
+    """Figures of a short and of a long run, each (seconds a keyframe, megabytes), and their ratios.
+
+    The ratio of memory has in both what a process holds before it has seen an image; what a keyframe adds is
+    `name.kb_per_keyframe`.
+    """
     out: dict[str, float] = {}
     for n, (seconds, mb) in zip(lengths, (short, long), strict=True):
         out |= {f"{name}.seconds_per_keyframe_{n}": seconds, f"{name}.peak_mb_{n}": mb}
     out[f"{name}.seconds_long_over_short"] = long[0] / short[0]
     out[f"{name}.memory_long_over_short"] = long[1] / short[1]
+    out[f"{name}.kb_per_keyframe"] = 1024.0 * (long[1] - short[1]) / (lengths[1] - lengths[0])
     return out

@@ -14,7 +14,8 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
     Returns:
         `smooth.seconds_per_keyframe_N_objects` and `smooth.over_filter_N_objects`, its seconds, the forward pass left
         out, over the filter's on the same run; `smooth.seconds_per_keyframe_L` and `smooth.peak_mb_L` of runs of two
-        lengths, with their ratios `smooth.seconds_long_over_short` and `smooth.memory_long_over_short`.
+        lengths, with their ratios `smooth.seconds_long_over_short` and `smooth.memory_long_over_short`, and
+        `smooth.kb_per_keyframe`, by which the memory grows.
     """
     figures: dict[str, float] = {}
     objects = (*sizes.objects, sizes.length_objects)

@@ -1,0 +1,53 @@
+"""What a smoothed object says between its views, and what of it a round needs to start from."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, SEEN, THERE, thing
+
+
+def moved(keyframes=(0, 2, 3, 5, 6)):
+    """A mug that stood here and then there, and isn't measured in every view."""
+    looks = [(k, HERE if k < 4 else THERE, SEEN if k != 3 else EMPTY) for k in keyframes]
+    return thing(0, *looks)
+
+
+def numbers(owner):
+    """Bytes of all that is held of the views."""
+    arrays = [a for stages in owner.stages.values() for s in stages for a in (s.T_world_centre, s.covariance)]
+    modes = [m for s in owner.sightings.values() for m in s.modes if m is not None]
+    return sum(a.nbytes for a in arrays) + sum(a.nbytes for m in modes for a in vars(m).values())
+
+
+@given(st.sets(st.integers(0, 7), min_size=1), st.integers(-2, 10))
+def test_a_pose_is_that_of_the_nearest_keyframe_the_earlier_of_two_and_held_from_the_last(keyframes, asked):
+    poses = {k: (np.diag([1.0, 1.0, 1.0, k]), np.eye(6)) for k in keyframes}
+    owner = thing(0, *((k, HERE, SEEN) for k in range(8))).with_poses(poses)
+    nearest = min(sorted(keyframes), key=lambda k: (abs(k - asked), k))
+    assert owner.pose_near(owner.best_class, asked)[0, 3, 3] == nearest
+    assert owner.held(asked).T_world_centre[3, 3] == max((k for k in keyframes if k <= asked), default=min(keyframes))
+
+
+@given(st.integers(0, 7))
+def test_what_a_round_starts_from_says_the_same_of_poses_and_classes(keyframe):
+    whole = moved()
+    start = whole.to_start_from()
+    for c in range(len(MODEL.shapes)):
+        np.testing.assert_array_equal(start.pose_near(c, keyframe), whole.pose_near(c, keyframe))
+        np.testing.assert_array_equal(start.modes_at(c, keyframe), whole.modes_at(c, keyframe))
+        assert len(whole.modes_at(c, keyframe)) == (keyframe in whole.keyframes)
+    assert start.presence_at(keyframe) == whole.presence_at(keyframe)
+    assert (start.exists, start.possible(MODEL), start.likely()) == (
+        whole.exists,
+        whole.possible(MODEL),
+        whole.likely(),
+    )
+    assert start.keyframes == whole.keyframes
+
+
+def test_and_holds_of_a_mode_its_pose_alone():
+    whole = moved()
+    modes = sum(len(s.T_world_centre) for stages in whole.stages.values() for s in stages)
+    assert numbers(whole.to_start_from()) == modes * 16 * 8
+    assert numbers(whole) > 5 * numbers(whole.to_start_from())
