@@ -33,11 +33,18 @@ from scipy.special import logsumexp
 from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.belief import REPORTED, Reported, predicted_spread
 from ctmap_gtsam.filtering.diagnostics import diagnostics, number
 from ctmap_gtsam.filtering.filter import Forward, forward
 from ctmap_gtsam.filtering.history import Kept, Past, Stage
-from ctmap_gtsam.filtering.particles import Particles, Spread, modes_of, systematic, transition_log_density
+from ctmap_gtsam.filtering.particles import (
+    Particles,
+    Spread,
+    modes_of,
+    predicted_spread,
+    systematic,
+    transition_log_density,
+)
+from ctmap_gtsam.filtering.reporting import REPORTED, Reported
 from ctmap_gtsam.frontend.place import describe
 from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctmap_gtsam.filtering.belief import Reported
+from ctmap_gtsam.filtering.reporting import Reported
 
 Array = NDArray[np.float64]
 

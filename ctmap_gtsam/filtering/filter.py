@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.belief import Belief, Reported, Updater
+from ctmap_gtsam.filtering.belief import Belief
 from ctmap_gtsam.filtering.diagnostics import Scored, diagnostics
 from ctmap_gtsam.filtering.history import one_past
 from ctmap_gtsam.filtering.identity import WAS_THERE, as_moved, at_place, moved_to, twin
+from ctmap_gtsam.filtering.reporting import Reported, Reporter
+from ctmap_gtsam.filtering.updating import Updater
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.company import Stand, company
 from ctmap_gtsam.frontend.keyframes import select_keyframes
@@ -85,6 +87,7 @@ class Forward:
         self.associator = Associator(model.config.frontend, model.catalogue)
         self.place = Place(run)
         self.updater = Updater(model, self.proposer, run.localisation, keep_past=keep_past)
+        self.reporter = Reporter(model, self.proposer, run.localisation)
         self.beliefs: dict[int, Belief] = {}
         self.owner: dict[int, int] = {}
         """track -> object"""
@@ -131,7 +134,7 @@ class Forward:
                 if unseen:
                     reported[i] = replace(before[i], visible=False, ledger=())
                 else:
-                    reported[i] = self.updater.report(belief, around, before.get(i))
+                    reported[i] = self.reporter.report(belief, around, before.get(i))
         new = [t for t in tracks if t.track_id not in self.owner]
         reported = self._start(new, observation, reported, before, stage)
         self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
@@ -190,7 +193,7 @@ class Forward:
                 i = track.track_id
                 with self._counted(i, stage, "new objects"):
                     started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
-            fresh = {i: self.updater.report(belief, surroundings.without(i)) for i, belief in started.items()}
+            fresh = {i: self.reporter.report(belief, surroundings.without(i)) for i, belief in started.items()}
         there = dict(reported)
         for i, report in fresh.items():
             known = at_place(report, there, self.model)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Reported
+from ctmap_gtsam.filtering.belief import Belief, ClassBelief
 from ctmap_gtsam.filtering.history import moved_past
+from ctmap_gtsam.filtering.reporting import Reported
 from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape, one_place_m

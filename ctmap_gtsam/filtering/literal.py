@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from ctmap_gtsam.building import Tables, build_estimate, localisation_covariance
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.belief import Reported
 from ctmap_gtsam.filtering.particles import Particles, modes_of, systematic
+from ctmap_gtsam.filtering.reporting import Reported
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import CENTRE_REGION, Observation, centre_depth, observations

@@ -23,11 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ctmap_gtsam.model import Model, localisation_variance
 from ctmap_gtsam.shapes import Shape
 from factors import mixture, symmetry
 from factors.mixture import LOG_2PI
 from factors.motions import retract
 from sequences import se3
+from sequences.types import LocalisationNoise
 
 Array = NDArray[np.float64]
 
@@ -265,6 +267,16 @@ def sufficient(particles: Particles, most: int, shape: Shape) -> int:
     away = symmetry.residual(particles.best(1)[0], particles.T_world_centre[rows], shape.symmetry)
     cells = np.unique(np.round(away / np.repeat(_CELL, 3)).astype(np.int64), axis=0)
     return int(np.clip(kld_bound(len(cells)), round(_LEAST_SHARE * most), most))
+
+
+def predicted_spread(model: Model, localisation: LocalisationNoise, dt_s: float, away_m: float) -> Spread:
+    """Sigma = Q dt, and by how much localisation may have gone off in between, at a distance from the camera."""
+    dt = max(dt_s, 1e-3)
+    walked = np.diag(model.prediction_covariance(dt))
+    # two recorded poses that lie closer than the correlation time err together
+    apart = 2.0 * (1.0 - np.exp(-dt / max(localisation.correlation_time_s, 1e-9)))
+    turned, moved = localisation_variance(localisation, away_m)
+    return Spread(float(np.sqrt(walked[0] + apart * turned)), float(np.sqrt(walked[3] + apart * moved)))
 
 
 def kld_bound(cells: int) -> int:

@@ -8,10 +8,10 @@ import pytest
 
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.backward import Tracer, _Line, _Link, backward_run, last_there, leaving, step_back
-from ctmap_gtsam.filtering.belief import Updater
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.history import Kept, Past, Stage, one_past
 from ctmap_gtsam.filtering.particles import Particles, Spread, Transition
+from ctmap_gtsam.filtering.updating import Updater
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model

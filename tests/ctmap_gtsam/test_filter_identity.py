@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Reported
+from ctmap_gtsam.filtering.belief import Belief, ClassBelief
 from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
 from ctmap_gtsam.filtering.particles import Particles
+from ctmap_gtsam.filtering.reporting import Reported
 from sequences import se3
 from tests.ctmap_gtsam.scenes import model_of
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import ClassBelief, Updater
+from ctmap_gtsam.filtering.belief import ClassBelief
 from ctmap_gtsam.filtering.memory import Memory
 from ctmap_gtsam.filtering.particles import Particles
+from ctmap_gtsam.filtering.updating import Updater
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Surroundings

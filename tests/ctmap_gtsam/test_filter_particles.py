@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import Updater
 from ctmap_gtsam.filtering.particles import (
     Gaussians,
     Particles,
@@ -17,6 +16,8 @@ from ctmap_gtsam.filtering.particles import (
     predicted_log_density,
     sufficient,
 )
+from ctmap_gtsam.filtering.reporting import Reporter
+from ctmap_gtsam.filtering.updating import Updater
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.landing import landing_log_density
 from ctmap_gtsam.frontend.surroundings import Surroundings
@@ -183,6 +184,10 @@ def test_a_thing_that_jumped_is_found_as_likely_as_the_prior_says(jump):
     assert after.classes[0].particles.best(1)[0, 0, 3] == pytest.approx(0.1, abs=0.01)
 
 
+def said_by(updater, belief, around):
+    return Reporter(updater.model, updater.proposer, updater.localisation).report(belief, around)
+
+
 @pytest.mark.parametrize("known", [True, False], ids=["known surface", "no surface"])
 def test_a_thing_that_was_moved_while_nobody_looked_is_met_as_likely_as_it_lands_there(known):
     """Equation 3, with the smoother's density of the new place; and it is reported as a move, though in sight."""
@@ -201,12 +206,12 @@ def test_a_thing_that_was_moved_while_nobody_looked_is_met_as_likely_as_it_lands
     landing = landing_log_density(model, shape, far[None], around.supports, np.diag(SCALE**2)[None])[0]
     assert gained == pytest.approx(moved + landing, abs=0.3)
     assert (landing > model.log_uniform(shape) + 1.0) == known
-    report = updater.report(after, around)
+    report = said_by(updater, after, around)
     assert report.moved > 0.99
     assert report.returned_ns == round(12 * 3600e9)
     stayed = Updater(model, GaussianProposer({0: REFERENCE, 1: REFERENCE}, covariance), LocalisationNoise())
     same = stayed.step(start, detection, observation_at(1, detection, 12 * 3600.0), around)
-    assert stayed.report(same, around).moved < 0.01
+    assert said_by(stayed, same, around).moved < 0.01
 
 
 @pytest.mark.parametrize("jump", [1e-12, 0.01])

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import Reported
 from ctmap_gtsam.filtering.filter import Forward
+from ctmap_gtsam.filtering.reporting import Reported
 from ctmap_gtsam.frontend.company import Stand, company
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.smoothing.graph import Camera, Measured, build

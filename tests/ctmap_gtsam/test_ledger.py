@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Glimpse, Updater
+from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Glimpse
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.particles import Particles
+from ctmap_gtsam.filtering.reporting import Reporter
 from ctmap_gtsam.frontend.proposer import Proposer
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.smoothing.graph import Camera, Measured, build
@@ -136,7 +137,7 @@ def test_a_lag_writes_each_keyframes_factors_once():
 
 def reported(model, shape, T, view, *, around=(), before=None, waited_s=None):
     """What the filter says of an object whose particles are all at one pose."""
-    updater = Updater(model, Proposer(model), LocalisationNoise())
+    reporter = Reporter(model, Proposer(model), LocalisationNoise())
     nothing = np.zeros(len(model.shapes))
     own = ClassBelief(Particles(T[None], np.zeros(1)), 100.0)
     classes = tuple(own if s is shape else None for s in model.shapes)
@@ -158,7 +159,7 @@ def reported(model, shape, T, view, *, around=(), before=None, waited_s=None):
         steps=1,
         glimpse=Glimpse(tile, observation.frame.T_camera_world, waited_s),
     )
-    said = updater.report(belief, Surroundings(tuple(around), ()), before)
+    said = reporter.report(belief, Surroundings(tuple(around), ()), before)
     return said, {(line.potential, line.other): line.nats for line in said.ledger}
 
 
