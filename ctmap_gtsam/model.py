@@ -119,6 +119,15 @@ class Model:
         """
         return np.repeat(localisation_variance(localisation, away_m), 3) + self.bias_sigmas(shape) ** 2
 
+    @property
+    def anywhere(self) -> Array:
+        """(6,) variances of a pose anywhere in the neighbourhood: any turn, and anywhere in a ball, rad^2 and m^2.
+
+        A uniform rotation's angle a has E a^2 = pi^2 / 3 + 2.
+        """
+        radius = self.config.prediction.region_radius_m
+        return np.repeat([(np.pi**2 / 3.0 + 2.0) / 3.0, radius**2 / 5.0], 3)
+
     def log_uniform(self, shape: Shape) -> float:
         """log density of a pose anywhere in the neighbourhood, over poses modulo the object's symmetries."""
         radius = self.config.prediction.region_radius_m

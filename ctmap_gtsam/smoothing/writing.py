@@ -134,8 +134,11 @@ def _belief(thing: Thing, k: int, held: Held, own: Mode, told: Told) -> Iterator
     there = ((i, told.things[i]) for i in shares if told.things[i].presence_at(k) > 0.5)
     places = {i: _mode(other, at, told) for i, other in there if (at := other.held(k)) is not None}
     own, modes = elsewhere(own, turned, shares, places)
-    yield from modes
-    yield own
+    # and it may be none of these: as in a view, so in all views of a visit, which err alike
+    missed = model.config.smoother.unmeasured
+    yield Mode(missed, own.T_world_centre, np.diag(model.anywhere))
+    for mode in (*modes, own):
+        yield mode.times(1.0 - missed)
 
 
 def _share_in_view(shape: Shape, T: Array, T_world_camera: Array, recording: Recording, k: int) -> float:

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctmap_gtsam.frontend.scoring import Scores
+from sequences import se3
 from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
 
@@ -58,6 +59,15 @@ def test_where_nothing_is_nothing_exists_and_without_poses_neither():
     exists, classes = MODEL.existence(nowhere, nowhere, 50.0, SEEN, 0.0)
     assert exists == 0.0
     assert classes.sum() == pytest.approx(1.0)
+
+
+def test_anywhere_has_the_moments_of_any_turn_and_any_place_in_the_neighbourhood():
+    rng = np.random.default_rng(0)
+    turns = se3.so3_log(se3.uniform_rotations(rng.random((40000, 3))))
+    places = rng.normal(size=(40000, 3))
+    radius = MODEL.config.prediction.region_radius_m * rng.random(40000) ** (1.0 / 3.0)
+    places *= (radius / np.linalg.norm(places, axis=-1))[:, None]
+    np.testing.assert_allclose(np.concatenate([turns, places], axis=-1).var(axis=0), MODEL.anywhere, rtol=0.03)
 
 
 @given(st.floats(10.0, 1e5), st.floats(-30.0, 30.0))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.smoothing.smoother import smooth_run
@@ -79,6 +80,16 @@ def test_mixtures_are_normalised_and_covariances_proper(estimate):
                 assert weight <= 1.0 + 1e-6
                 if own.any() and c == estimate.best_class[row, k]:
                     assert weight > 0.98  # but for modes that are too unlikely to be written
+
+
+def test_a_belief_holds_that_it_may_be_none_of_its_poses(estimate):
+    """In all that is reported of a pose is the chance that all views got it wrong, and it is never the pose."""
+    m = estimate.modes
+    wide = np.linalg.eigvalsh(m.covariance[:, :3, :3])[:, 0] > 1.0
+    np.testing.assert_allclose(np.exp(m.log_weight[wide]), Config().smoother.unmeasured, rtol=1e-6)
+    pairs = {(int(i), int(k)) for i, k in zip(m.object, m.keyframe, strict=True)}
+    assert {(int(i), int(k)) for i, k in zip(m.object[wide], m.keyframe[wide], strict=True)} == pairs
+    assert not wide[estimate.best_mode[estimate.best_mode >= 0]].any()
 
 
 def test_what_was_taken_away_was_there_before_and_not_after():
