@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,9 +148,7 @@ def frame_errors(
                 mspd[n, f] = _mspd(true, T, T_true, [cameras[k] for k in np.flatnonzero(f)])
     beliefs = [detection.belief(method, int(row), truth.class_id[n]) for n, row in enumerate(matching.row)]
     return FrameErrors(
-        late=_late(truth),
-        situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
-        confusable=np.isin(truth.class_id, list(confusable)),
+        **_kinds(run, truth, confusable),
         class_id=said,
         class_correct=detection.class_correct(truth, method.objects, matching),
         class_probability=np.array([b.probability for b in beliefs]).reshape(truth.visible.shape),
@@ -163,6 +162,15 @@ def frame_errors(
         mspd_recall=_recall(mspd / widths * (640.0 / 100.0)),  # 5 px of 640 is the least threshold, as 5 % is
         vsd_recall=vsd_recall(run.catalogue, measured, truth, method.objects, matching),
     )
+
+
+def _kinds(run: Run, truth: ObjectFrames, confusable: Collection[int]) -> dict[str, Any]:
+    """What kind of object-frames these are, whatever a method says of them: (N, F) each."""
+    return {
+        "late": _late(truth),
+        "situation": situations(truth.visible, np.array([frame.visit for frame in run.frames])),
+        "confusable": np.isin(truth.class_id, list(confusable)),
+    }
 
 
 def _mspd(shape: Shape, T: Array, T_true: Array, cameras: Sequence[Camera]) -> Array:
@@ -185,9 +193,7 @@ def detector_errors(
     """(N, F) the same of the detector's boxes, which have classes and no poses."""
     nothing = np.where(truth.visible, np.inf, np.nan)
     return FrameErrors(
-        late=_late(truth),
-        situation=situations(truth.visible, np.array([frame.visit for frame in run.frames])),
-        confusable=np.isin(truth.class_id, list(confusable)),
+        **_kinds(run, truth, confusable),
         class_id=score.class_id,
         class_correct=(score.class_id == truth.class_id) & truth.present,
         class_probability=score.class_probability,
