@@ -98,7 +98,9 @@ class Context:
     )
     support_tolerance_m: float = option(0.008, "gaps and dents up to this are errors of the surface, metres", low=0.0)
     support_sigma_m: float = option(0.01, "how far beyond that a thing may seem to float, metres", low=1e-4)
-    standing_tilt_rad: float = option(0.012, "how far from flat on its face a thing stands, rad", low=1e-5)
+    standing_tilt_rad: float = option(
+        0.1, "how far from flat on its face a thing on a level surface may seem to stand, rad", low=1e-5
+    )
     other_support: float = option(0.3, "chance that a thing rests on what was not seen", low=1e-9, high=1.0)
     penetration_sigma_m: float = option(0.003, "how deep a thing may seem to sink into another, metres", low=1e-4)
     doubt: float = option(

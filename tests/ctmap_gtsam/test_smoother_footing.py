@@ -15,7 +15,7 @@ from sequences.geometry import Plane
 from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import UP, classes, config_of, level, shape_named, standing
 
-MODEL = Model(classes("mug", "cereal_box", "soup_can"), config_of(), context=True)
+MODEL = Model(classes("mug", "cereal_box", "soup_can"), config_of("context.standing_tilt_rad=0.012"), context=True)
 MUG, BOX, CAN = (shape_named(MODEL, name) for name in ("mug", "cereal_box", "soup_can"))
 
 
