@@ -107,6 +107,11 @@ class Context:
         1e-6, "chance that a neighbour or a surface isn't where it is believed to be", low=1e-300, high=0.5
     )
 
+    @property
+    def bearing_m(self) -> float:
+        """How far from a surface a thing may seem to end that stands on it, metres."""
+        return self.support_tolerance_m + 2.0 * self.support_sigma_m
+
 
 @dataclass(frozen=True)
 class Frontend:

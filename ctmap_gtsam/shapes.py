@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import permutations, product
 
 import numpy as np
 import trimesh
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from trimesh.poses import compute_stable_poses
 
-from factors.symmetry import Symmetry, residual
+from factors.symmetry import AXIS_TURNS, Symmetry, residual
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh, ObjectClass
 from sequences.distance import DistanceField, distance_field, spread
@@ -123,15 +122,15 @@ class Shape:
         """
         points = spread(self.mesh)
         points = points[:: -(-len(points) // _TWIN_POINTS)]
-        off = np.array([np.abs(self.distance.at(points @ R.T)).mean() for R in _TURNS])
+        off = np.array([np.abs(self.distance.at(points @ R.T)).mean() for R in AXIS_TURNS])
         nearly = max(NEARLY * self.radius_m, min(_ALIKE * self.radius_m, _ALIKE_M))
         kept: list[Array] = [np.eye(3)]
         for k in np.argsort(off, kind="stable"):
-            T = se3.make(_TURNS[k], np.zeros(3))
+            T = se3.make(AXIS_TURNS[k], np.zeros(3))
             there = se3.make(np.stack(kept), np.zeros((len(kept), 3)))
             apart = np.linalg.norm(residual(there, T, self.symmetry)[..., :3], axis=-1).min()
             if off[k] < nearly and apart > _SAME_RAD and len(kept) <= _TWINS:
-                kept.append(_TURNS[k])
+                kept.append(AXIS_TURNS[k])
         return np.stack(kept)[1:]
 
     def surface_points(self, n: int) -> Array:
@@ -161,15 +160,6 @@ class Shape:
         if free.shape[-1] == 0:
             return free
         return np.asarray(np.linalg.qr(se3.adjoint(self.T_object_centre) @ free)[0])
-
-
-def _turns() -> Array:
-    """(24, 3, 3) rotations that carry the axes into each other."""
-    signed = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
-    return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
-
-
-_TURNS = _turns()
 
 
 def build_shapes(catalogue: Catalogue, faces: int) -> tuple[Shape, ...]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,15 @@ from sequences.catalogue import ObjectClass
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+def _axis_turns() -> Array:
+    signed = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
+    return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
+
+
+AXIS_TURNS = _axis_turns()
+"""(24, 3, 3) rotations that carry a frame's axes into each other"""
 
 
 def _identity() -> Array:

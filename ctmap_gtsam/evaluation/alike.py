@@ -12,12 +12,14 @@ points (Besl and McKay, A method for registration of 3-D shapes, PAMI 1992) from
 
 from __future__ import annotations
 
-from itertools import combinations, permutations, product
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from factors.symmetry import AXIS_TURNS
 from sequences import se3
 from sequences.catalogue import Catalogue, Mesh
 from sequences.distance import spread
@@ -73,18 +75,17 @@ def surface_distance(a: Surface, b: Surface) -> float:
 def _laid_over(a: Surface, b: Surface) -> float:
     """The same with a drawn onto b."""
     few = _thinned(a.points, _FEW)
-    off = np.array([b.tree.query(few @ R.T)[0].mean() for R in _TURNS])
-    return min(_apart(a, b, _drawn(a, b, _TURNS[k])) for k in np.argsort(off, kind="stable")[:_WAYS])
+    off = np.array([b.tree.query(few @ R.T)[0].mean() for R in AXIS_TURNS])
+    return min(_apart(a, b, _drawn(a, b, AXIS_TURNS[k])) for k in np.argsort(off, kind="stable")[:_WAYS])
 
 
 def _drawn(a: Surface, b: Surface, R: Array) -> Array:
-    """T_b_a (4, 4) after iterated closest points from a rotation (3, 3); each step is Kabsch's (1976)."""
+    """T_b_a (4, 4) after iterated closest points from a rotation (3, 3); each step is Kabsch's (1976), by SciPy."""
     T = se3.make(R, np.zeros(3))
     for _ in range(_STEPS):
         pairs = b.tree.data[b.tree.query(se3.transform(T, a.points))[1]]
         middle, other = a.points.mean(axis=0), pairs.mean(axis=0)
-        U, _, Vt = np.linalg.svd((pairs - other).T @ (a.points - middle))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = Rotation.align_vectors(pairs - other, a.points - middle)[0].as_matrix()
         T = se3.make(R, other - R @ middle)
     return T
 
@@ -99,12 +100,3 @@ def _apart(a: Surface, b: Surface, T_b_a: Array) -> float:
 def _thinned(points: Array, n: int) -> Array:
     """About n of points (m, 3), spread over the list."""
     return points[:: -(-len(points) // n)]
-
-
-def _turns() -> Array:
-    """(24, 3, 3) rotations that carry the axes into each other."""
-    signed = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
-    return np.stack([R for R in signed if np.linalg.det(R) > 0.0])
-
-
-_TURNS = _turns()

@@ -66,8 +66,7 @@ class _Standing:
 
     def __init__(self, estimate: Estimate, model: Model, up: Array) -> None:
         self.estimate, self.model, self.up = estimate, model, up
-        settings = model.config.context
-        self.within_m = settings.support_tolerance_m + 2.0 * settings.support_sigma_m
+        self.within_m = model.config.context.bearing_m
 
     def on(self, row: int, keyframe: int, surfaces: tuple[Plane, ...]) -> int:
         """Row of the object, or -1 - k for surface k, that bears one; `NO_SUPPORT` where nothing is known to."""

@@ -86,11 +86,9 @@ def _directions(face: Array, shape: Shape) -> Array:
 
 def _bears(T_world_centre: Array, shape: Shape, surfaces: tuple[Plane, ...], model: Model) -> bool:
     """Whether a pose (4, 4) ends at a surface, as exactly as surfaces and supports are known."""
-    settings = model.config.context
-    within = settings.support_tolerance_m + 2.0 * settings.support_sigma_m
     points = shape.hull_points @ T_world_centre[:3, :3].T + T_world_centre[:3, 3]
     return any(
-        abs(float((points @ plane.normal).min() - plane.offset)) <= within
+        abs(float((points @ plane.normal).min() - plane.offset)) <= model.config.context.bearing_m
         for plane in surfaces
         if plane.contains(T_world_centre[None, :3, 3]).item()
     )

@@ -356,8 +356,7 @@ class _Walk:
         first = self.window.first
         chosen = objects_of(things, self.recording, self.model)
         noise, place = self.recording.run.localisation, self.recording.place
-        solved = self.window.solve(self.model, self.cameras, noise, chosen, self.company, place)
-        smoothed, self.window = solved
+        smoothed, self.window = self.window.solve(self.model, self.cameras, noise, chosen, self.company, place)
         self.ends[smoothed.solution.end] += 1
         if self.solution is None or self.solution.end == "converged" or smoothed.solution.end != "converged":
             self.solution = smoothed.solution
