@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import log_ndtr
 
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
@@ -27,6 +28,7 @@ from sequences.types import Detection, LocalisationNoise
 Array = NDArray[np.float64]
 
 _EDGES = 4.0  # of a box
+_TRUE_NATS = 1e-9  # that the mesh of a thing may be wrong by that explains nothing
 
 
 def localisation_variance(noise: LocalisationNoise, away_m: float) -> tuple[float, float]:
@@ -183,6 +185,22 @@ class Model:
     def class_evidence(self, summed: Array) -> Array:
         """(C,) log evidence of the true class c from class_scores (C,) summed over a track and visit: saturating."""
         return persistent_class_log_evidence(summed, self.log_confusion)
+
+    def between_classes(self, log_evidence: Array) -> Array:
+        """What depth and boxes say of the classes (C,), where that has an end: nats; -inf for none.
+
+        A mesh isn't quite the thing. What it is off by costs it a share of what it explains in every view alike, with
+        standard deviation `sensor.mesh_share`, and more views don't lessen that: a class that is behind by z of these
+        is the true one with probability Phi(-z), if its evidence doesn't give it more.
+
+        Args:
+            log_evidence: (C,) of each class's poses, against nothing being there.
+        """
+        best = float(log_evidence.max())
+        if not np.isfinite(best):
+            return log_evidence
+        z = (best - log_evidence) / max(self.config.sensor.mesh_share * best, _TRUE_NATS)
+        return np.maximum(log_evidence, best + log_ndtr(-z) - log_ndtr(z))
 
     def clutter_detection(
         self, visible: Array, detection: Detection | None, image_size: tuple[int, int], first: bool

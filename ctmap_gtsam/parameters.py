@@ -40,6 +40,9 @@ class Sensor:
     bias_surface_m: float = option(
         0.002, "how far off a thing's surface may be as a whole: turns it by this over its radius, metres", low=0.0
     )
+    mesh_share: float = option(
+        0.03, "what a thing's mesh is off by costs it this share of what it explains, alike in all views", low=1e-6
+    )
     occlusion_margin_m: float = option(0.02, "a measurement so far in front of an object is an occluder", low=0.0)
 
 

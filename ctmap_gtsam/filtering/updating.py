@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 _INFLATION = 2.0  # of the modes' covariances when proposing: a proposal with lighter tails gives wild weights
 _LIKELY = 15.0  # nats behind the best class within which modes are probed with care
-_DORMANT = (45.0, 0.25)  # nats behind the best class, and share of its evidence, beyond which a class sleeps
+_DORMANT = (45.0, 0.25)  # by so much less than the best class, or that share of it, does a class explain that sleeps
 _STARTS = 3  # heaviest particles that a likely class's modes are looked for from
 _WAKE_EVERY = 15  # keyframes in view between two at which what sleeps is weighed and searched for
 _BETTER = 10.0  # nats by which a pose that is found late must explain more than what was believed of its class
@@ -289,11 +289,12 @@ class Updater:
         evidence = belief.class_log_evidence(self.model)
         counts, best = self._counts(evidence), int(np.argmax(evidence))
         behind = evidence - evidence[best]
-        depth = belief.classes[best]
+        depth, explained = belief.classes[best], belief.explained
         least, share = _DORMANT
         bound = max(least, share * (0.0 if depth is None else depth.log_evidence))
         # what wakes is searched for: it may be behind because nobody found it
-        awake = (behind > -bound) | (search and belief.steps // _WAKE_EVERY > belief.searched // _WAKE_EVERY)
+        waking = search and belief.steps // _WAKE_EVERY > belief.searched // _WAKE_EVERY
+        awake = (explained - explained[best] > -bound) | waking
         efforts = np.full(len(evidence), self.model.config.filter.search_share if search else 0.0)
         named = self._named(belief)
         lost = depth is None or depth.log_evidence < belief.log_clutter

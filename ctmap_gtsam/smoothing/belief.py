@@ -271,7 +271,7 @@ def judge(
         evidence[c] = posteriors[c].log_evidence
     scores = _score_evidence(boxes, recording, model)
     clutter = float(sum(s.log_clutter for s in sightings.values()))
-    log_evidence = evidence + scores - np.log(len(model.shapes))
+    log_evidence = model.between_classes(evidence) + scores - np.log(len(model.shapes))
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
     best = int(np.argmax(log_evidence))
     witness = _witness(stages[best], posteriors[best], sightings, best) if best in stages else 0.0

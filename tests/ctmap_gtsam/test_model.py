@@ -1,11 +1,16 @@
 """Laws of existence: what a track is believed to be, beside what no mesh explains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import norm
 
+from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
+from ctmap_gtsam.parameters import Sensor
 from sequences import se3
 from sequences.types import LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
@@ -130,3 +135,37 @@ def test_a_box_of_its_own_does_not_speak_for_what_hides(fit, some, more):
     assert (no_less >= less - 1e-9) == (fit >= np.log(outlier) - 1e-9) or less == pytest.approx(no_less)
     # and without a box being hidden says nothing
     assert MODEL.detection(np.array([0.0]), None)[0] == 0.0
+
+
+SHARE = MODEL.config.sensor.mesh_share
+TRUE = model_of("mug", "soup_can", "cereal_box", config=replace(Config(), sensor=Sensor(mesh_share=1e-6)))
+explained = st.lists(st.floats(0.0, 3000.0) | st.just(-np.inf), min_size=3, max_size=3).map(np.array)
+
+
+@given(explained, st.permutations(range(3)))
+def test_what_meshes_are_off_by_leaves_classes_in_their_order(evidence, order):
+    bounded = MODEL.between_classes(evidence)
+    assert bounded.max() == evidence.max()
+    assert (bounded >= evidence).all()
+    np.testing.assert_array_equal(np.sort(bounded), bounded[np.argsort(evidence)])
+    np.testing.assert_array_equal(MODEL.between_classes(evidence[order]), bounded[order])
+
+
+@given(st.floats(0.0, 5.0), st.floats(100.0, 1e5))
+def test_more_views_are_no_surer_of_the_class_than_the_mesh_is_true(z, explained):
+    _, behind = MODEL.between_classes(explained * np.array([1.0, 1.0 - z * SHARE]))
+    log_odds = norm.logcdf(-z) - norm.logcdf(z)
+    assert behind - explained >= log_odds - 1e-6
+    if z * SHARE * explained >= -log_odds:  # else the views themselves say less
+        assert behind - explained == pytest.approx(log_odds, abs=1e-6)
+
+
+@given(st.floats(1e-3, 50.0), st.floats(1.0, 3000.0))
+def test_a_mesh_that_is_true_tells_classes_apart_by_all_that_depth_says(gap, explained):
+    evidence = np.array([explained, explained - gap, -np.inf])
+    np.testing.assert_allclose(TRUE.between_classes(evidence), evidence, atol=1e-6)
+
+
+def test_what_explains_nothing_is_no_part_of_it():
+    for evidence in (np.array([-3.0, -1.0, -40.0]), np.full(3, -np.inf)):
+        np.testing.assert_array_equal(MODEL.between_classes(evidence), evidence)
