@@ -165,11 +165,16 @@ def highlight(
 
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few objects and keyframes, to try it out.")]
+Keep = Annotated[
+    Path | None,
+    typer.Option("--keep", metavar="DIR", help="Keep what each run took, and go on from there if it is stopped."),
+]
 
 
 @bench_app.command(name="filter")
 def filter_(
     quick: Quick = False,
+    keep: Keep = None,
     json_file: JsonFile = None,
     config_file: ConfigFile = None,
     assignments: Assignments = None,
@@ -177,16 +182,19 @@ def filter_(
 ) -> None:
     """The filter's keyframes a second against objects, particles and the length of the run, and its memory (synthetic).
 
-    A camera goes round a table, 640 x 480; 5 to 40 things are in view all the time. The whole takes most of an hour.
+    A camera goes round a table, 640 x 480; 5 to 40 things are in view all the time. The whole takes most of an hour;
+    --keep holds what was measured, for this version alone. Seconds are CPU seconds.
 
     Example: `ctmap bench filter --quick --json filter.json`
     """
-    _figures("filter", json_file, config_file, assignments, seed, sizes=_sizes(quick))
+    folder = None if keep is None else writable(keep)
+    _figures("filter", json_file, config_file, assignments, seed, sizes=_sizes(quick), keep=folder)
 
 
 @bench_app.command()
 def smooth(
     quick: Quick = False,
+    keep: Keep = None,
     json_file: JsonFile = None,
     config_file: ConfigFile = None,
     assignments: Assignments = None,
@@ -194,11 +202,12 @@ def smooth(
 ) -> None:
     """The smoother's time beside the filter's, against objects and the length of the run, and its memory (synthetic).
 
-    The runs are those of `ctmap bench filter`.
+    The runs are those of `ctmap bench filter`, which aren't measured again where it has kept them.
 
     Example: `ctmap bench smooth --quick --json smooth.json`
     """
-    _figures("smooth", json_file, config_file, assignments, seed, sizes=_sizes(quick))
+    folder = None if keep is None else writable(keep)
+    _figures("smooth", json_file, config_file, assignments, seed, sizes=_sizes(quick), keep=folder)
 
 
 def _sizes(quick: bool) -> Any:

@@ -7,7 +7,7 @@ call over arrays (`factors.terms`). GTSAM gets them as JacobianFactors, beside w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,16 +75,15 @@ class Problem:
                 linear.add(*factor, noise)
         return linear
 
-    def _linearised(self, values: Any) -> list[tuple[Array, tuple[Array, ...]]]:
+    def _linearised(self, values: Any) -> Iterator[tuple[Array, tuple[Array, ...]]]:
+        """Batch by batch: all Jacobians at once are as much again as the graph that is made of them."""
         rows = gtsam.utilities.extractPose3(values)
         poses = np.zeros((len(rows), 4, 4))
         poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:], 1.0
         vectors = np.array([values.atVector(key) for key in self._vectors]).reshape(-1, 6)
-        out = []
         for batch, places in zip(self._batches, self._places, strict=True):
             arrays = [(poses if among_poses else vectors)[at] for among_poses, at in places]
-            out.append(_checked(batch, *batch.terms.linearised(arrays)))
-        return out
+            yield _checked(batch, *batch.terms.linearised(arrays))
 
 
 def _is_pose(values: Any, key: int) -> bool:

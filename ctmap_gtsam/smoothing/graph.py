@@ -9,7 +9,7 @@ prior on b_iv from here.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -25,6 +25,7 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.batched import Batch, Problem
 from ctmap_gtsam.smoothing.footing import footings
+from ctmap_gtsam.smoothing.marginals import covariances
 from ctmap_gtsam.smoothing.solver import Solution, optimise
 from factors import symmetry
 from factors.custom import stay_factor, terms_factor
@@ -368,56 +369,6 @@ def smooth(
     }
     T, covariance = (np.stack([camera[i] for camera in cameras]) for i in range(2))
     return Smoothed(solution, T, covariance, poses, built.contributions(solution.values))
-
-
-def covariances(linear: Any, keys: Sequence[int]) -> dict[int, Array]:
-    """Key -> marginal covariance (6, 6), as gtsam.Marginals has it.
-
-    GTSAM keeps what a clique needs to know of all above it, and of a long run that is more than the Bayes tree itself.
-    So the tree is read branch by branch, and a branch that has been read is let go.
-
-    Args:
-        linear: gtsam.GaussianFactorGraph; given up as soon as it is eliminated, if nobody else holds it.
-        keys: of which variables.
-    """
-    tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-    del linear
-    out: dict[int, Array] = {}
-    for clique, own in branches(tree, keys):
-        for key in own:
-            out[key] = tree.marginalCovariance(key)
-        if clique is not None:
-            clique.deleteCachedShortcuts()
-    return out
-
-
-def branches(tree: Any, keys: Sequence[int]) -> Iterator[tuple[Any | None, list[int]]]:
-    """The cliques from each root down, and which keys are theirs; a clique without keys where its branch has ended."""
-    cliques: dict[int, Any] = {}
-    own: dict[int, list[int]] = {}
-    below: dict[int, list[int]] = {}
-    roots: list[int] = []
-    for key in keys:
-        clique = tree[key]
-        name = clique.conditional().firstFrontalKey()
-        own.setdefault(name, []).append(key)
-        while name not in cliques:
-            cliques[name] = clique
-            if clique.isRoot():
-                roots.append(name)
-                break
-            clique, child = clique.parent(), name
-            name = clique.conditional().firstFrontalKey()
-            below.setdefault(name, []).append(child)
-    ahead = [(root, False) for root in reversed(roots)]
-    while ahead:
-        name, read = ahead.pop()
-        if read:
-            yield cliques[name], []
-            continue
-        yield None, own.get(name, [])
-        ahead.append((name, True))
-        ahead += [(child, False) for child in below.get(name, [])]
 
 
 def _add_cameras(built: SmootherGraph, cameras: Sequence[Camera], noise: LocalisationNoise, first: int) -> None:

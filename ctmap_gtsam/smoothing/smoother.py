@@ -85,6 +85,33 @@ class Rounds:
     """whether the last round changed nothing of note"""
 
 
+@dataclass(frozen=True)
+class Found:
+    """What a round found in the images: what its map is made from."""
+
+    boxes: Mapping[int, Boxes]
+    """object -> its detections"""
+    sightings: Mapping[int, Mapping[int, Sighting]]
+    """object -> keyframe -> modes"""
+    company: Mapping[int, Company]
+    """visit -> who was moved together before it"""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What of an object tells whether a round changed anything."""
+
+    best_class: int
+    exists: bool
+    anchor: Array | None
+    """(4, 4)"""
+
+
+def outlines(current: Map) -> dict[int, Outline]:
+    """Of all objects of a map."""
+    return {i: Outline(thing.best_class, thing.exists, thing.anchor) for i, thing in current.things.items()}
+
+
 _KEPT = (
     *(Rounds, Map, Smoothed, Contributions, Solution, Thing, Detection, Sighting, PoseModes, Stage, Posterior),
     *(Partner, InstanceRelation),
@@ -129,14 +156,18 @@ def smooth_run(
     checkpoint = None if keep is None else Checkpoint(keep, _key(run, forward, config), _KEPT)
     state: Rounds | None = None if checkpoint is None else checkpoint.load()
     if state is None:
-        first = _first_round(recording, proposer, seeds(forward, model), told)
-        state = _stepped(first, [], False, proposer, checkpoint)
+        found = _first_look(recording, proposer, seeds(forward, model), told)
+        state = _stepped(_solve(recording, model, found), None, [], proposer, checkpoint)
+        del found
     proposer.hypotheses_scored = state.hypotheses_scored
     while not _enough(state, config):
+        # of all that was kept of a long run, nothing is held any longer than the next step asks for it
         state = replace(state, current=state.current.to_start_from())
-        following = _next_round(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
-        settled = _settled(state.current, following, model)
-        state = _stepped(following, state.energies, settled, proposer, checkpoint)
+        found = _next_look(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
+        before, energies = outlines(state.current), state.energies
+        del state
+        state = _stepped(_solve(recording, model, found), before, energies, proposer, checkpoint)
+        del found
     current = state.current
     if look is not None:
         built, objects = _graph(recording, model, current.things, current.company)
@@ -148,9 +179,14 @@ def smooth_run(
 
 
 def _stepped(
-    following: Map, energies: list[dict[str, float]], settled: bool, proposer: Proposer, checkpoint: Checkpoint | None
+    following: Map,
+    before: Mapping[int, Outline] | None,
+    energies: list[dict[str, float]],
+    proposer: Proposer,
+    checkpoint: Checkpoint | None,
 ) -> Rounds:
-    """The state after a round, which is kept."""
+    """The state after a round, which is kept; None = before it there was no map."""
+    settled = before is not None and _settled(before, outlines(following), proposer.model)
     state = Rounds(following, [*energies, dict(following.energy)], proposer.hypotheses_scored, settled)
     if checkpoint is not None:
         checkpoint.save(state)
@@ -176,7 +212,7 @@ def _key(run: Run, forward: Estimate, config: Config) -> dict[str, object]:
     }
 
 
-def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, Seed], progress: Progress) -> Map:
+def _first_look(recording: Recording, proposer: Proposer, seeds: Mapping[int, Seed], progress: Progress) -> Found:
     """Every object of the forward pass starts from all poses that it ever was believed to have."""
     model = proposer.model
 
@@ -194,11 +230,10 @@ def _first_round(recording: Recording, proposer: Proposer, seeds: Mapping[int, S
         there = (seed.neighbour(k, float(len(boxes[j])), model) for j, seed in seeds.items())
         return Surroundings(tuple(n for n in there if n is not None), recording.place.surfaces)
 
-    sightings = gather(recording, proposer, wanted, boxes, around, progress, "round 1")
-    return _solve(recording, model, boxes, sightings, {})
+    return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, "round 1"), {})
 
 
-def _next_round(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Map:
+def _next_look(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Found:
     """Start from the smoothed map; every object's background is the map of the others."""
     model = proposer.model
     visits = visits_of(recording)
@@ -215,18 +250,12 @@ def _next_round(recording: Recording, proposer: Proposer, current: Map, progress
         return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces, company[visits[k]])
 
     boxes = associate(recording, model, current.things, expected)
-    sightings = gather(recording, proposer, wanted, boxes, around, progress, name)
-    return _solve(recording, model, boxes, sightings, company)
+    return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, name), company)
 
 
-def _solve(
-    recording: Recording,
-    model: Model,
-    boxes: Mapping[int, Boxes],
-    sightings: Mapping[int, Mapping[int, Sighting]],
-    company: Mapping[int, Company],
-) -> Map:
+def _solve(recording: Recording, model: Model, found: Found) -> Map:
     """Trellis for every object, identities over gaps, then one graph."""
+    boxes, sightings, company = found.boxes, found.sightings, found.company
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, recording, model), recording, model)
     built, objects = _graph(recording, model, things, company)
@@ -246,17 +275,17 @@ def _graph(
     return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place), objects
 
 
-def _settled(a: Map, b: Map, model: Model) -> bool:
+def _settled(a: Mapping[int, Outline], b: Mapping[int, Outline], model: Model) -> bool:
     """Whether nothing of note changed from one round to the next."""
-    if a.things.keys() != b.things.keys():
+    if a.keys() != b.keys():
         return False
-    for i, thing in b.things.items():
-        before = a.things[i]
-        if thing.best_class != before.best_class or thing.exists != before.exists:
+    for i, after in b.items():
+        before = a[i]
+        if after.best_class != before.best_class or after.exists != before.exists:
             return False
-        if thing.anchor is None or before.anchor is None:
+        if after.anchor is None or before.anchor is None:
             continue
-        r = residual(before.anchor, thing.anchor, model.shapes[thing.best_class].symmetry)
+        r = residual(before.anchor, after.anchor, model.shapes[after.best_class].symmetry)
         if np.linalg.norm(r[:3]) > _SETTLED[0] or np.linalg.norm(r[3:]) > _SETTLED[1]:
             return False
     return True

@@ -72,6 +72,7 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
             if full is not None and energy - linear.error(full) <= _MORE * little:
                 return Solution(moved, after, "converged", tuple(trace))
         values, energy = moved, after
+        del linear, step, moved  # or they are held while the next ones are made
         if fell <= little and damping <= _FIRST:
             damping = max(damping * _GROWTH, _FIRST)  # the linearisation is far off: shorter steps
         else:

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from ctmap_gtsam.bench import run_bench
-from ctmap_gtsam.bench.scaling import filter as scaling_filter
-from ctmap_gtsam.bench.scaling import smooth as scaling_smooth
+from ctmap_gtsam.bench.scaling import parts as scaling_parts
 from ctmap_gtsam.bench.scaling.loop import looped, write_loop
-from ctmap_gtsam.bench.scaling.measuring import FORWARD, Measured, measure, peak_mb, with_particles
+from ctmap_gtsam.bench.scaling.measuring import Measured, forward, measure, peak_mb, with_particles
 from ctmap_gtsam.bench.scaling.sizes import QUICK
 from sequences.bop import load_run
 from tests.ctmap_gtsam.scenes import CHEAP, config_of
@@ -68,16 +67,14 @@ def pretended(method, folder, keyframes, config):
     """A machine on which a keyframe takes 0.1 s, the first ten 1 s, the smoother twice that, and memory grows."""
     each = tuple([1.0] * min(keyframes, 10) + [0.1] * (keyframes - 10))
     assert folder.is_dir()
-    forward = folder / FORWARD
-    assert method == "filter" or forward.read_text() == f"{keyframes}"
-    forward.write_text(f"{keyframes}")
+    assert method == "filter" or forward(folder, keyframes).exists()
+    forward(folder, keyframes).touch()
     return Measured(sum(each) * (2.0 if method == "smooth" else 1.0), each, 100.0 + keyframes, 1)
 
 
-@pytest.mark.parametrize("module", [scaling_filter, scaling_smooth])
-def test_figures_are_of_what_was_measured(monkeypatch, module):
-    monkeypatch.setattr(module, "measure", pretended)
-    name = module.__name__.rsplit(".", 1)[-1]
+@pytest.mark.parametrize("name", ["filter", "smooth"])
+def test_figures_are_of_what_was_measured(monkeypatch, name):
+    monkeypatch.setattr(scaling_parts, "measure", pretended)
     figures = run_bench(name, config_of(), sizes=TINY)["figures"]
     json.dumps(figures, allow_nan=False)
     factor = 2.0 if name == "smooth" else 1.0
@@ -88,7 +85,30 @@ def test_figures_are_of_what_was_measured(monkeypatch, module):
     assert figures[f"{name}.kb_per_keyframe"] == pytest.approx(1024.0)
     if name == "smooth":
         assert figures["smooth.over_filter_1_objects"] == pytest.approx(2.0)
+        assert figures["smooth.over_filter_40_keyframes"] == pytest.approx(2.0)
     else:
         assert figures["filter.keyframes_per_s_1_objects"] == pytest.approx(10 / (4 * 1.0 + 6 * 0.1))
         assert figures["filter.start_s_1_objects"] == pytest.approx(6.0)
         assert figures["filter.late_over_early"] == pytest.approx(1.0)
+
+
+def test_what_was_measured_before_it_was_stopped_is_not_measured_again(monkeypatch, tmp_path):
+    asked = []
+
+    def counted(method, folder, keyframes, config):
+        asked.append((method, keyframes, config.filter.particles))
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return pretended(method, folder, keyframes, config)
+
+    monkeypatch.setattr(scaling_parts, "measure", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench("filter", CONFIG, sizes=TINY, keep=tmp_path)
+    whole = run_bench("filter", CONFIG, sizes=TINY, keep=tmp_path)["figures"]
+    assert asked[2:] == [("filter", 20, 60)] * 2 + [("filter", 40, 60)]
+    assert run_bench("filter", CONFIG, sizes=TINY, keep=tmp_path)["figures"] == whole
+    assert len(asked) == 5
+    run_bench("smooth", CONFIG, sizes=TINY, keep=tmp_path)
+    assert all(method == "smooth" for method, *_ in asked[5:])
+    run_bench("filter", config_of(*CHEAP, "filter.particles=77"), sizes=TINY, keep=tmp_path)
+    assert ("filter", 16, 77) in asked

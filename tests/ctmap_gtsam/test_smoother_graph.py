@@ -14,11 +14,7 @@ from ctmap_gtsam.smoothing.graph import (
     Camera,
     Measured,
     bias_key,
-    branches,
     build,
-    camera_key,
-    covariances,
-    object_key,
     shared_flatness,
     smooth,
 )
@@ -153,31 +149,6 @@ def test_it_is_the_rauch_tung_striebel_smoother(seed, noise, visits):
         np.testing.assert_allclose(smoothed.T_world_camera[k][:3, 3], m[3:6], atol=1e-8)
         np.testing.assert_allclose(smoothed.camera_covariance[k][3:, 3:], P[3:6, 3:6], rtol=1e-5, atol=1e-14)
     assert smoothed.solution.end == "converged"
-
-
-def test_marginals_read_branch_by_branch_are_those_of_gtsam_and_hold_fewer_cliques():
-    problem = some_problem(0, noise=0.003)
-    built = build(MODEL, problem.cameras(), problem.noise, {0: (MUG, problem.modes())})
-    keys = [*map(camera_key, range(len(problem.times))), *(object_key(0, k) for k in problem.measured)]
-
-    def linear():
-        return built.problem().linearize(built.initial)
-
-    whole = gtsam.Marginals(linear(), built.initial)
-    for key, covariance in covariances(linear(), keys).items():
-        np.testing.assert_array_equal(covariance, whole.marginalCovariance(key))
-    tree = linear().eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear()))
-    read, held = [], []
-    for ended, own in branches(tree, keys):
-        for key in own:
-            tree.marginalCovariance(key)
-        read += own
-        held.append(tree.numCachedSeparatorMarginals())
-        if ended is not None:
-            ended.deleteCachedShortcuts()
-    assert sorted(read) == sorted(keys)
-    assert max(held) < tree.size()
-    assert tree.numCachedSeparatorMarginals() == 0
 
 
 def test_a_thousand_views_of_one_visit_leave_the_bias():

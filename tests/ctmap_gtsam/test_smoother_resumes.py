@@ -1,5 +1,6 @@
 """Smoothing that was stopped between two rounds goes on from the last one, and ends in the same bytes."""
 
+import tracemalloc
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -144,3 +145,37 @@ def test_a_state_comes_back_to_the_last_bit(tmp_path_factory, tree):
 def test_what_it_does_not_know_is_refused(tmp_path):
     with pytest.raises(TypeError, match="Some"):
         Checkpoint(tmp_path / "state.npz", {}, ()).save(Some(1))
+    with pytest.raises(TypeError, match="objects"):
+        Checkpoint(tmp_path / "state.npz", {}, ()).save(np.array([None]))
+
+
+def test_what_ends_half_way_leaves_what_was_kept_before(tmp_path):
+    checkpoint = Checkpoint(tmp_path / "state.npz", {}, ())
+    checkpoint.save([np.arange(3)])
+    with pytest.raises(TypeError):
+        checkpoint.save([np.arange(5), Some(1)])
+    same([np.arange(3)], checkpoint.load())
+    assert list(tmp_path.iterdir()) == [tmp_path / "state.npz"]
+
+
+def test_a_number_that_changed_on_disk_is_noticed(tmp_path):
+    checkpoint = Checkpoint(tmp_path / "state.npz", {}, ())
+    checkpoint.save([np.full(100, 7.0)])
+    data = checkpoint.path.read_bytes()
+    at = data.index(np.full(100, 7.0).tobytes())
+    checkpoint.path.write_bytes(data[: at + 80] + np.float64(8.0).tobytes() + data[at + 88 :])
+    assert checkpoint.load() is None
+
+
+def test_a_state_is_not_held_twice(tmp_path):
+    """Neither the numbers nor the tree, of which a long run has many small pieces."""
+    state = [(np.full((6, 6), float(i)), {i: 0.1 * i}) for i in range(20_000)]
+    checkpoint = Checkpoint(tmp_path / "state.npz", {}, ())
+    tracemalloc.start()
+    try:
+        checkpoint.save(state)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 0.1 * sum(array.nbytes for array, _ in state)
+    same(state[-1], checkpoint.load()[-1])

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
-from ctmap_gtsam.bench.scaling.measuring import Measured, measure, with_particles
-from ctmap_gtsam.bench.scaling.sizes import FULL, Sizes, by_length, loops
+from ctmap_gtsam.bench.scaling.measuring import Measured
+from ctmap_gtsam.bench.scaling.parts import parts
+from ctmap_gtsam.bench.scaling.sizes import FULL, Sizes, by_length
 from ctmap_gtsam.config import Config
 from sequences.progress import SILENT, Progress
 
 
-def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dict[str, float]:
+def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL, keep: Path | None = None) -> dict[str, float]:
     """Measure.
+
+    Args:
+        config: settings.
+        progress: is told how far it is.
+        sizes: of the runs.
+        keep: a folder for what was measured, from which it goes on when it was stopped; None = nothing is kept.
 
     Returns:
         `filter.keyframes_per_s_N_objects`, of keyframes after all objects were begun, and `filter.start_s_N_objects`,
@@ -19,27 +28,25 @@ def run(config: Config, progress: Progress = SILENT, sizes: Sizes = FULL) -> dic
         `filter.peak_mb_L` of runs of two lengths, all keyframes included, with their ratios
         `filter.seconds_long_over_short` and `filter.memory_long_over_short`, and `filter.kb_per_keyframe`, by which the
         memory grows; `filter.late_over_early`, seconds a keyframe at the end of the long run over those of as many
-        keyframes near its beginning.
+        keyframes near its beginning. Seconds are CPU seconds.
     """
     figures: dict[str, float] = {}
-    objects = (*sizes.objects, sizes.length_objects)
     steps = len(sizes.objects) + len(sizes.particles) + 2
-    with loops(objects, sizes.round_frames, config.seed, progress) as paths, progress.stage("filter", steps) as stage:
+    begun = 2 * config.frontend.start_after
+    with parts(keep, config, sizes.round_frames, progress) as runs, progress.stage("filter", steps) as stage:
         for n in sizes.objects:
-            seen = measure("filter", paths[n], sizes.keyframes, config)
-            begun = 2 * config.frontend.start_after
+            seen = runs.measured("filter", n, sizes.keyframes)
             figures[f"filter.keyframes_per_s_{n}_objects"] = 1.0 / float(np.mean(seen.each_s[begun:]))
             figures[f"filter.start_s_{n}_objects"] = float(np.sum(seen.each_s[:begun]))
             figures[f"filter.found_{n}_objects"] = float(seen.objects)
             stage.advance()
         for m in sizes.particles:
-            seen = measure("filter", paths[sizes.middle], sizes.keyframes, with_particles(config, m))
-            begun = 2 * config.frontend.start_after
+            seen = runs.measured("filter", sizes.middle, sizes.keyframes, m)
             figures[f"filter.keyframes_per_s_{m}_particles"] = 1.0 / float(np.mean(seen.each_s[begun:]))
             stage.advance()
         both = []
         for length in sizes.lengths:
-            both.append(measure("filter", paths[sizes.length_objects], length, config))
+            both.append(runs.measured("filter", sizes.length_objects, length))
             stage.advance()
     short, long = both
     figures |= by_length("filter", _cost(short, sizes.lengths[0]), _cost(long, sizes.lengths[1]), sizes.lengths)

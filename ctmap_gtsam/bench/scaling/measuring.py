@@ -1,4 +1,7 @@
-"""One estimator on one run in a process of its own: seconds a keyframe, and the most memory it ever held."""
+"""One estimator on one run in a process of its own: seconds a keyframe, and the most memory it ever held.
+
+Seconds are those that the process had a core for, all threads together: other programs on the machine count little.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +27,13 @@ from sequences.bop import load_run
 METHODS: dict[str, Callable[..., Estimate]] = {"filter": filter_run, "smooth": smooth_run}
 """the smoother takes the filter's estimate, too"""
 
-FORWARD = "filter-ct.npz"
-"""beside a round: what the filter said last, for the smoother to begin with"""
 
 WARM = 4  # keyframes of a first run, which loads kernels and builds what is built once
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What one run took."""
+    """What one run took, CPU seconds."""
 
     seconds: float
     """all of it"""
@@ -44,12 +45,18 @@ class Measured:
     """in the estimate"""
 
 
+def forward(folder: Path, keyframes: int) -> Path:
+    """Beside a round: what the filter said last of so many keyframes, for the smoother to begin with."""
+    return folder / f"filter-ct-{keyframes}.npz"
+
+
 def measure(method: str, folder: Path, keyframes: int, config: Config) -> Measured:
     """Run an estimator on so many keyframes of a loop, in a fresh process.
 
     Args:
         method: "filter" or "smooth".
-        folder: one round, by `loop.write_loop`. The filter leaves its estimate there, and the smoother begins from it.
+        folder: one round, by `loop.write_loop`. The filter leaves its estimate there (`forward`), and the smoother
+            begins from it.
         keyframes: of the run.
         config: settings.
 
@@ -76,15 +83,15 @@ def _work(connection: Connection, method: str, folder: Path, keyframes: int, con
     warm = filter_run(looped(round_, WARM), config)
     if smooth:
         smooth_run(looped(round_, WARM), warm, config)
-    given = (Estimate.load(folder / FORWARD),) if smooth else ()
+    given = (Estimate.load(forward(folder, keyframes)),) if smooth else ()
     run, estimator = looped(round_, keyframes), METHODS[method]
     clock = _Clock()
     estimate = estimator(run, *given, config, progress=clock)
-    seconds = time.perf_counter() - clock.began
+    seconds = time.process_time() - clock.began
     each = tuple(float(s) for s in np.diff([clock.began, *clock.ticks]))
     measured = Measured(seconds, each, peak_mb(), len(estimate.object_id))
     if not smooth:
-        estimate.save(folder / FORWARD)
+        estimate.save(forward(folder, keyframes))
     connection.send(measured)
 
 
@@ -92,7 +99,7 @@ def _work(connection: Connection, method: str, folder: Path, keyframes: int, con
 class _Clock:
     """A progress that notes when each step of the first stage ended."""
 
-    began: float = field(default_factory=time.perf_counter)
+    began: float = field(default_factory=time.process_time)
     ticks: list[float] = field(default_factory=list)
     _first: bool = True
 
@@ -109,7 +116,7 @@ class _Ticks:
 
     def advance(self, n: int = 1) -> None:
         """Note the time."""
-        self.ticks.append(time.perf_counter())
+        self.ticks.append(time.process_time())
 
     def spent(self, part: str, seconds: float) -> None:
         """Parts are not told apart."""

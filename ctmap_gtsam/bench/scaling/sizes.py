@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from ctmap_gtsam.bench.scaling.loop import ROUND, write_loop
-from sequences.progress import Progress
+from ctmap_gtsam.bench.scaling.loop import ROUND
 
 
 @dataclass(frozen=True)
@@ -35,16 +30,6 @@ class Sizes:
 
 FULL = Sizes((5, 10, 20, 40), (100, 300, 1000), (100, 2000), 5, 40)
 QUICK = Sizes((2, 5), (100, 300), (30, 120), 2, 15, round_frames=30)
-
-
-@contextmanager
-def loops(objects: Sequence[int], frames: int, seed: int, progress: Progress) -> Iterator[dict[int, Path]]:
-    """A round of each number of objects, in a temporary folder."""
-    with TemporaryDirectory(prefix="ctmap-bench-") as folder:
-        paths = {n: Path(folder) / f"{n}" for n in sorted(set(objects))}
-        for n, path in paths.items():
-            write_loop(path, n, seed, frames, progress)
-        yield paths
 
 
 def by_length(
