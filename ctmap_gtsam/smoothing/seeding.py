@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 _KEPT = 8  # poses of a class that an object starts from, at most
 _ONE_POSE = (0.15, 0.015)  # rad, metres: what was believed nearer to each other at different times is one pose
 _LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care at first
+_NEARBY_M = (
+    0.1  # another class no farther than that from where a thing stood is another opinion, if it was pushed or not
+)
 _EVER = 0.05  # an object that never existed with this probability isn't started from
 
 
@@ -104,8 +107,8 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
 
     Those that are still there at its end, or were taken away. What was taken for one of them in the end is that one
     from its own beginning on, since the filter learned late where it had gone. What was given up where no other object
-    was then begins anew, and so does who came back: an object that is of one class in a visit and of another in a later
-    one may be two, and the second has an id of its own.
+    was then begins anew, and so does who came back: an object that is of one class in a visit and of another elsewhere
+    in a later one may be two, and the second has an id of its own.
     """
     out: dict[int, Seed] = {}
     let_go: list[Seed] = []
@@ -113,7 +116,7 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
     unused = itertools.count(int(forward.object_id.max(initial=-1)) + 1)
     for row, object_id in enumerate(forward.object_id):
         if forward.best_mode[row, last] >= 0 and forward.existence[row].max() >= _EVER:
-            for n, (first, end) in enumerate(_lives(row, forward)):
+            for n, (first, end) in enumerate(_lives(row, forward, model)):
                 i = next(unused) if n else int(object_id)
                 out[i] = _seed(i, row, forward, model, first, end)
         elif forward.existence[row].max() > EXISTS:
@@ -128,22 +131,29 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
     return dict(sorted(out.items()))
 
 
-def _lives(row: int, forward: Estimate) -> list[tuple[int, int]]:
-    """Keyframes, from the first to before the second, in which an object of the forward pass was of one class.
+def _lives(row: int, forward: Estimate, model: Model) -> list[tuple[int, int]]:
+    """Keyframes, from the first to before the second, in which an object of the forward pass was one thing.
 
     Within a visit it is the same thing, and what is believed of it at the visit's end is what it was.
     """
-    begun, before = [0], None
+    begun: list[int] = [0]
+    before: tuple[int, Array] | None = None
     for visit in np.unique(forward.keyframe_visit):
         own = np.flatnonzero(forward.keyframe_visit == visit)
         there = own[forward.existence[row, own] > EXISTS]
         if not len(there) or forward.class_probability[row, there[-1]].max() <= SURE:
             continue
-        c = int(np.argmax(forward.class_probability[row, there[-1]]))
-        if before is not None and c != before:
+        (_, at), after = (_opinion(row, k, forward, model) for k in there[[0, -1]])
+        if before is not None and after[0] != before[0] and not np.linalg.norm(at - before[1]) < _NEARBY_M:
             begun.append(int(own[0]))
-        before = c
+        before = after
     return list(itertools.pairwise([*begun, len(forward.keyframe_frame)]))
+
+
+def _opinion(row: int, k: int, forward: Estimate, model: Model) -> tuple[int, Array]:
+    """The most probable class of an object at a keyframe, and where (3,) its centre is; NaN where nobody knows."""
+    c = int(np.argmax(forward.class_probability[row, k]))
+    return c, model.shapes[c].to_centre(forward.pose[row, k])[:3, 3]
 
 
 def _stands_at(other: Seed, seed: Seed, keyframe: int, model: Model) -> bool:

@@ -60,8 +60,8 @@ def test_a_class_found_late_is_the_class(run):
     assert [NAMES[seed.best_class] for seed in found.values()] == ["bowl"]
 
 
-def test_what_is_of_another_class_in_a_later_visit_may_be_another_thing(run):
-    mug, bowl, gone = ("mug", HERE, 0.9), ("bowl", HERE, 0.9), ("bowl", HERE, 0.1)
+def test_what_is_of_another_class_elsewhere_in_a_later_visit_may_be_another_thing(run):
+    mug, bowl, gone = ("mug", HERE, 0.9), ("bowl", THERE, 0.9), ("bowl", THERE, 0.1)
     visits = replace(forward(run, [mug] * 3 + [bowl] * 3), keyframe_visit=np.array([0, 0, 0, 1, 1, 1]))
     found = seeds(visits, MODEL)
     assert {i: NAMES[seed.best_class] for i, seed in found.items()} == {10: "mug", 11: "bowl"}
@@ -70,6 +70,15 @@ def test_what_is_of_another_class_in_a_later_visit_may_be_another_thing(run):
     # what it would be if it were there is nothing that came
     vanished = replace(forward(run, [mug] * 3 + [gone] * 3), keyframe_visit=np.array([0, 0, 0, 1, 1, 1]))
     assert sorted(seeds(vanished, MODEL)) == [10]
+
+
+def test_another_class_in_the_same_place_is_another_opinion_of_one_thing(run):
+    visits = np.array([0, 0, 0, 1, 1, 1])
+    (seed,) = seeds(
+        replace(forward(run, [("mug", HERE, 0.9)] * 3 + [("bowl", HERE, 0.9)] * 3), keyframe_visit=visits), MODEL
+    ).values()
+    assert {NAMES[c] for c in seed.poses} == {"mug", "bowl"}
+    assert seed.there.all()
 
 
 def test_what_was_given_up_begins_anew_where_nothing_else_was(run):
