@@ -29,9 +29,8 @@ Array = NDArray[np.float64]
 _KEPT = 8  # poses of a class that an object starts from, at most
 _ONE_POSE = (0.15, 0.015)  # rad, metres: what was believed nearer to each other at different times is one pose
 _LIKELY = 1e-3  # classes less probable than this in the forward pass are not probed with care at first
-_NEARBY_M = (
-    0.1  # another class no farther than that from where a thing stood is another opinion, if it was pushed or not
-)
+_ALIKE = 1e-3  # visits between which a thing is of one class with this probability may hold two opinions of it, ...
+_NEARBY_M = 0.1  # ... if it is no farther away than it may have been pushed
 _EVER = 0.05  # an object that never existed with this probability isn't started from
 
 
@@ -107,28 +106,40 @@ def seeds(forward: Estimate, model: Model) -> dict[int, Seed]:
 
     Those that are still there at its end, or were taken away. What was taken for one of them in the end is that one
     from its own beginning on, since the filter learned late where it had gone. What was given up where no other object
-    was then begins anew, and so does who came back: an object that is of one class in a visit and of another elsewhere
-    in a later one may be two, and the second has an id of its own.
+    was then begins anew, and so does who came back: an object that is of one class in a visit and of another in a later
+    one may be two, and the second has an id of its own.
     """
     out: dict[int, Seed] = {}
     let_go: list[Seed] = []
+    ended: list[Seed] = []
     last = len(forward.keyframe_frame) - 1
     unused = itertools.count(int(forward.object_id.max(initial=-1)) + 1)
     for row, object_id in enumerate(forward.object_id):
-        if forward.best_mode[row, last] >= 0 and forward.existence[row].max() >= _EVER:
-            for n, (first, end) in enumerate(_lives(row, forward, model)):
-                i = next(unused) if n else int(object_id)
-                out[i] = _seed(i, row, forward, model, first, end)
-        elif forward.existence[row].max() > EXISTS:
-            let_go.append(_seed(int(object_id), row, forward, model, 0, last + 1))
-    # the last first: what was taken for what was taken for an object is that object
+        stays = forward.best_mode[row, last] >= 0 and forward.existence[row].max() >= _EVER
+        for n, (first, end) in enumerate(_lives(row, forward, model)):
+            if not stays and forward.existence[row, first:end].max() <= EXISTS:
+                continue
+            seed = _seed(next(unused) if n else int(object_id), row, forward, model, first, end)
+            if stays:
+                out[seed.object_id] = seed
+            else:
+                (let_go if end > last else ended).append(seed)
+    # the last first: what was taken for what was taken for an object is that object, but for what it was before
     for seed in sorted(let_go, key=lambda s: (-s.surest, s.object_id)):
         heir = next((i for i, other in sorted(out.items()) if _stands_at(other, seed, seed.surest + 1, model)), None)
-        if heir is not None:
+        if heir is None:
+            out |= _begun_anew(seed, out, model)
+        else:
             out[heir] = _begun_as(out[heir], seed, model)
-        elif not any(_stands_at(other, seed, seed.surest, model) for other in out.values()):
-            out[seed.object_id] = seed
+    for seed in ended:
+        out |= _begun_anew(seed, out, model)
     return dict(sorted(out.items()))
+
+
+def _begun_anew(seed: Seed, others: Mapping[int, Seed], model: Model) -> dict[int, Seed]:
+    """By its id what was given up, where none of the others was then."""
+    beside = any(_stands_at(other, seed, seed.surest, model) for other in others.values())
+    return {} if beside else {seed.object_id: seed}
 
 
 def _lives(row: int, forward: Estimate, model: Model) -> list[tuple[int, int]]:
@@ -137,23 +148,39 @@ def _lives(row: int, forward: Estimate, model: Model) -> list[tuple[int, int]]:
     Within a visit it is the same thing, and what is believed of it at the visit's end is what it was.
     """
     begun: list[int] = [0]
-    before: tuple[int, Array] | None = None
+    before: _Opinion | None = None
     for visit in np.unique(forward.keyframe_visit):
         own = np.flatnonzero(forward.keyframe_visit == visit)
         there = own[forward.existence[row, own] > EXISTS]
         if not len(there) or forward.class_probability[row, there[-1]].max() <= SURE:
             continue
-        (_, at), after = (_opinion(row, k, forward, model) for k in there[[0, -1]])
-        if before is not None and after[0] != before[0] and not np.linalg.norm(at - before[1]) < _NEARBY_M:
+        first, after = (_Opinion.of(row, k, forward, model) for k in there[[0, -1]])
+        if before is not None and not before.may_be(first.at, after.class_probability):
             begun.append(int(own[0]))
         before = after
     return list(itertools.pairwise([*begun, len(forward.keyframe_frame)]))
 
 
-def _opinion(row: int, k: int, forward: Estimate, model: Model) -> tuple[int, Array]:
-    """The most probable class of an object at a keyframe, and where (3,) its centre is; NaN where nobody knows."""
-    c = int(np.argmax(forward.class_probability[row, k]))
-    return c, model.shapes[c].to_centre(forward.pose[row, k])[:3, 3]
+@dataclass(frozen=True)
+class _Opinion:
+    """What the forward pass says of an object at a keyframe."""
+
+    class_probability: Array
+    """(C,)"""
+    at: Array
+    """(3,) its centre in the world; NaN where nobody knows"""
+
+    @classmethod
+    def of(cls, row: int, k: int, forward: Estimate, model: Model) -> _Opinion:
+        p = forward.class_probability[row, k]
+        return cls(p, model.shapes[int(np.argmax(p))].to_centre(forward.pose[row, k])[:3, 3])
+
+    def may_be(self, at: Array, class_probability: Array) -> bool:
+        """Whether what is met later, at (3,) and of classes (C,), may be the same thing, called by another name."""
+        if np.argmax(class_probability) == np.argmax(self.class_probability):
+            return True
+        alike = float(class_probability @ self.class_probability) > _ALIKE
+        return alike and bool(np.linalg.norm(at - self.at) < _NEARBY_M)
 
 
 def _stands_at(other: Seed, seed: Seed, keyframe: int, model: Model) -> bool:
