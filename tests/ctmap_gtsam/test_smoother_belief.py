@@ -1,10 +1,18 @@
 """What a smoothed object says between its views, and what of it a round needs to start from."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, SEEN, THERE, thing
+from ctmap_gtsam.filtering.belief import Belief, ClassBelief
+from ctmap_gtsam.filtering.particles import Particles
+from ctmap_gtsam.frontend.proposer import PoseModes
+from ctmap_gtsam.smoothing.belief import judge
+from ctmap_gtsam.smoothing.modes import Sighting
+from sequences.types import Detection
+from tests.ctmap_gtsam.scenes import model_of
+from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, thing
 
 
 def moved(keyframes=(0, 2, 3, 5, 6)):
@@ -51,3 +59,26 @@ def test_and_holds_of_a_mode_its_pose_alone():
     modes = sum(len(s.T_world_centre) for stages in whole.stages.values() for s in stages)
     assert numbers(whole.to_start_from()) == modes * 16 * 8
     assert numbers(whole) > 5 * numbers(whole.to_start_from())
+
+
+@pytest.mark.parametrize(("behind", "named"), [(0.01, True), (0.5, False)])
+def test_between_classes_that_explain_as_much_but_for_their_meshes_error_the_detector_decides(behind, named):
+    """However many views there are; filter and smoother weigh classes alike (`Model.between_classes`)."""
+    model = model_of("mug", "cereal_box")
+    views = {k: nats * np.array([1.0, 1.0 - behind]) for k, nats in enumerate(np.linspace(50.0, 400.0, 8))}
+    boxes = {k: Detection((10.0, 10.0, 40.0, 40.0), np.array([0.02, 0.03, 0.95])) for k in views}
+    covariance = np.diag(np.repeat([1e-4, 1e-6], 3))[None]
+
+    def modes(nats):
+        return PoseModes(HERE[None], np.array([nats]), np.array([nats]), covariance, np.array([2.0]))
+
+    sightings = {k: Sighting(k, tuple(map(modes, nats)), (np.zeros(1),) * 2, 0.0) for k, nats in views.items()}
+    assert (judge(0, boxes, sightings, RECORDING, model).best_class == 1) == named
+    explained = sum(views.values())
+    particles = Particles(HERE[None], np.zeros(1))
+    classes = tuple(ClassBelief(particles, float(nats)) for nats in explained)
+    scores = np.sum([model.class_scores(box) for box in boxes.values()], axis=0)
+    filtered = Belief(
+        0, classes, scores, np.zeros(2), 0.0, 0.0, -np.inf, 0, 0, 0, 0, np.ones(3), True, 8, None
+    )  # fmt: skip
+    assert (np.argmax(filtered.class_log_evidence(model)) == 1) == named
