@@ -89,12 +89,13 @@ def json_bytes(value: Any) -> bytes:
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Arrays as one compressed .npz without pickle, whole or not at all; the same arrays give the same bytes."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name in sorted(arrays):
             data = io.BytesIO()
             np.lib.format.write_array(data, np.asanyarray(arrays[name]), allow_pickle=False)
-            # np.savez stamps the time of day
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), data.getvalue())
+            # np.savez stamps the time of day; what an entry's own info doesn't say of compression counts as none
+            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            archive.writestr(entry, data.getvalue(), zipfile.ZIP_DEFLATED)
     write_bytes(path, buffer.getvalue())
 
 

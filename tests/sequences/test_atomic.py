@@ -38,8 +38,9 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new(tmp_path):
     target = tmp_path / "result.json"
     atomic.write_json(target, {"value": [0] * 20000, "last": 0})
     rng = np.random.default_rng(0)
-    written = set()
-    for _ in range(20):
+    written: list[int] = []
+    # on a busy machine many a writer is killed before it has written anything
+    while len(written) < 20 or (len(set(written)) < 2 and len(written) < 400):
         with subprocess.Popen([sys.executable, "-c", WRITER, target], cwd=ROOT, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == b"ready\n"
@@ -47,8 +48,8 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new(tmp_path):
             process.send_signal(signal.SIGKILL)
         result = json.loads(target.read_text())
         assert result["value"] == [result["last"]] * 20000
-        written.add(result["last"])
-    assert len(written) > 1, "no process was killed after it had written anything"
+        written.append(result["last"])
+    assert len(set(written)) > 1, "no process was killed after it had written anything"
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_beside(tmp_path, monkeypatch):
@@ -103,3 +104,15 @@ def test_files_can_be_read_by_whom_the_umask_allows(tmp_path):
     atomic.write_text(tmp_path / "ours", "x")
     (tmp_path / "plain").write_text("x")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_arrays_come_back_as_they_were_from_the_same_bytes_and_few_of_them(tmp_path):
+    arrays = {"poses": np.tile(np.eye(4), (1000, 1, 1)), "meta": np.array("text"), "none": np.zeros((0, 6))}
+    atomic.write_npz(tmp_path / "a.npz", arrays)
+    atomic.write_npz(tmp_path / "b.npz", dict(reversed(arrays.items())))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert set(archive.files) == set(arrays)
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(archive[name], array)
+    assert (tmp_path / "a.npz").stat().st_size < 0.1 * arrays["poses"].nbytes
