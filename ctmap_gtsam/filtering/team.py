@@ -20,10 +20,10 @@ from sequences.progress import Stage
 LEAST_OBJECTS = 3
 """fewer don't keep two cores busy"""
 
-LEAST_WORK = 300
-"""objects times keyframes to come, from which on it pays to start processes, which takes some seconds of a core ..."""
+LEAST_WORK = 500
+"""objects times keyframes to come, from which on it pays to start processes, which takes some seconds of a core"""
 
-_BEGINNING = 20  # ... where the searches that an object begins with are worth so many keyframes
+_BEGINNING = 20  # keyframes that the searches which an object begins with are worth
 
 
 class Team:

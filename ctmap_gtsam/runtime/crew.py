@@ -74,7 +74,7 @@ class Crew:
         size: how many.
         imports: modules that they need.
         work: what does a job, pickled when the first job is given.
-        known: parts of `work` that jobs refer to and that aren't sent with them.
+        known: parts of `work` that what jobs share refers to, and that aren't sent with it.
     """
 
     def __init__(self, size: int, imports: Sequence[str], work: Work, known: Sequence[Any] = ()) -> None:
@@ -97,13 +97,14 @@ class Crew:
             here.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
             self._workers.append(_Worker(Connection(here.detach())))
 
-    def do(self, shared: Any, jobs: Sequence[Any], here: Callable[[Any], Any]) -> list[Any]:
+    def do(self, shared: Any, jobs: Sequence[Any], here: Callable[[Any], Any] | None = None) -> list[Any]:
         """Answers to all jobs, in their order.
 
         Args:
             shared: what they share; mustn't change meanwhile.
             jobs: the dearest first.
-            here: does a job in this process, for as long as not all workers are ready for more.
+            here: does a job in this process, for as long as not all workers are ready for more; where not given,
+                this process waits for them.
 
         Raises:
             InputError: a worker was killed. What a job raises is raised as it is.
@@ -115,9 +116,9 @@ class Crew:
                 for worker in self._workers:
                     # the last jobs go to whoever is free first
                     if left and self._takes(worker, ahead) and (ahead == 0 or len(left) > len(self._workers)):
-                        told = told or self._dumped((None, shared))
+                        told = told or self._dumped(shared)
                         self._give(worker, told, *left.popleft())
-            if left and not all(worker.warm for worker in self._workers):
+            if left and here is not None and not all(worker.warm for worker in self._workers):
                 number, job = left.pop()
                 answers[number] = here(job)
                 self._collect(answers, 0.0)
@@ -148,7 +149,7 @@ class Crew:
             if worker.shared is not shared:
                 worker.connection.send_bytes(shared)
                 worker.shared = shared
-            worker.connection.send_bytes(self._dumped((number, job)))
+            worker.connection.send_bytes(pickle.dumps((number, job), pickle.HIGHEST_PROTOCOL))
         except OSError as error:
             raise self._lost() from error
         worker.jobs += 1
@@ -170,9 +171,9 @@ class Crew:
                 raise answer.error
             answers[number] = answer
 
-    def _dumped(self, message: Any) -> bytes:
+    def _dumped(self, shared: Any) -> bytes:
         file = io.BytesIO()
-        _Pickler(file, self._known).dump(message)
+        _Pickler(file, self._known).dump((None, shared))
         return file.getvalue()
 
     def _lost(self) -> InputError:
