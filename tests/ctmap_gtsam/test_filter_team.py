@@ -4,11 +4,13 @@ import operator
 from contextlib import contextmanager
 from types import SimpleNamespace
 
+import numba
 import pytest
 
 from ctmap_gtsam.filtering import team
 from ctmap_gtsam.filtering.tasks import Done
 from ctmap_gtsam.filtering.team import LEAST_OBJECTS, LEAST_WORK, Team
+from ctmap_gtsam.runtime.threads import cores
 
 PLENTY = 10 * LEAST_WORK
 
@@ -48,17 +50,17 @@ class FakeHand:
 
 
 @contextmanager
-def team_of(monkeypatch, cores, possible=True):
+def team_of(monkeypatch, there, possible=True):
     FakeCrew.last = None
     monkeypatch.setattr(team.crew, "Crew", FakeCrew)
     monkeypatch.setattr(team.crew, "possible", lambda: possible)
-    monkeypatch.setattr(team, "cores", lambda: cores)
+    monkeypatch.setattr(team, "cores", lambda: there)
     with Team(FakeHand()) as ours:
         yield ours
 
 
 @pytest.mark.parametrize(
-    ("objects", "keyframes", "cores", "possible", "size"),
+    ("objects", "keyframes", "there", "possible", "size"),
     [
         (LEAST_OBJECTS, PLENTY, 2, True, 2),
         (10, PLENTY, 8, True, 8),
@@ -68,8 +70,8 @@ def team_of(monkeypatch, cores, possible=True):
         (LEAST_OBJECTS, 5, 2, True, None),
     ],
 )
-def test_processes_are_started_where_they_pay_one_a_core(monkeypatch, objects, keyframes, cores, possible, size):
-    with team_of(monkeypatch, cores, possible) as ours:
+def test_processes_are_started_where_they_pay_one_a_core(monkeypatch, objects, keyframes, there, possible, size):
+    with team_of(monkeypatch, there, possible) as ours:
         ours.grow(objects, keyframes)
         started = FakeCrew.last
         assert (None if started is None else started.size) == size
@@ -88,11 +90,21 @@ def test_the_dearest_are_begun_first_and_what_is_worth_nothing_is_not_sent(monke
         assert len(FakeCrew.last.given) == 1
 
 
-@pytest.mark.parametrize("cores", [1, 2])
-def test_seconds_are_those_of_the_clock_by_what_was_spent(monkeypatch, cores):
+@pytest.mark.parametrize("there", [1, 2])
+def test_seconds_are_those_of_the_clock_by_what_was_spent(monkeypatch, there):
     listener = Listener()
-    with team_of(monkeypatch, cores) as ours:
+    with team_of(monkeypatch, there) as ours:
         ours.grow(10, PLENTY)
         ours.do(range(5), [1.0] * 5, "scene", listener)
     assert sum(listener.spent_s.values()) < 1.0
     assert operator.truediv(*listener.spent_s.values()) == pytest.approx(3.0)
+
+
+def test_one_setting_says_how_many_threads_and_how_many_processes():
+    before = numba.get_num_threads()
+    try:
+        for n in (1, before):
+            numba.set_num_threads(n)
+            assert cores() == n
+    finally:
+        numba.set_num_threads(before)
