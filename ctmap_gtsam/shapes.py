@@ -69,7 +69,7 @@ class Shape:
         """Stable rests by convex hull and centre of mass, and how likely each is (Goldberg et al., 1999; trimesh)."""
         hull = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False).convex_hull
         T, probability = compute_stable_poses(hull, sigma=0.0, n_samples=1, threshold=0.01)
-        return T[:, :3, :3], np.sqrt(probability) / np.sqrt(probability).sum()
+        return np.ascontiguousarray(T[:, :3, :3]), np.sqrt(probability) / np.sqrt(probability).sum()
 
     @property
     def rests(self) -> Array:

@@ -28,6 +28,10 @@ class Scored:
         self.keyframes.append(0)
         self.objects.append({})
 
+    def last(self, object_id: int) -> int:
+        """How many an object had at the keyframe before."""
+        return self.objects[-2].get(object_id, 0) if len(self.objects) > 1 else 0
+
     def add(self, object_id: int, count: int) -> None:
         """So many for an object."""
         self.keyframes[-1] += count

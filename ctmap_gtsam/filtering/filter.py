@@ -7,10 +7,10 @@ the weights account for; the context multiplies the reported posterior once, not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,15 @@ from ctmap_gtsam.filtering.belief import Belief
 from ctmap_gtsam.filtering.diagnostics import Scored, diagnostics
 from ctmap_gtsam.filtering.history import one_past
 from ctmap_gtsam.filtering.identity import WAS_THERE, as_moved, at_place, moved_to, twin
-from ctmap_gtsam.filtering.reporting import Reported, Reporter
-from ctmap_gtsam.filtering.updating import Updater
+from ctmap_gtsam.filtering.reporting import Reported
+from ctmap_gtsam.filtering.tasks import Done, Hand, Scene, Search, Start, Step, with_past, without_past
+from ctmap_gtsam.filtering.team import Team
 from ctmap_gtsam.frontend.association import Associator, Track
 from ctmap_gtsam.frontend.company import Stand, company
 from ctmap_gtsam.frontend.keyframes import select_keyframes
 from ctmap_gtsam.frontend.observation import Observation, observations
 from ctmap_gtsam.frontend.place import Place, describe
-from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.proposer import PoseModes
 from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings
 from ctmap_gtsam.model import Model
@@ -41,6 +42,8 @@ Array = NDArray[np.float64]
 
 NEIGHBOUR_PROBABILITY = 0.8
 """an object whose existence and class are both surer than this counts as a neighbour"""
+
+_SEARCH = 4.0  # times as dear as another is a step with a search
 
 
 def filter_run(
@@ -67,7 +70,7 @@ def forward(
     model = Model(run.catalogue, config, context=context)
     keyframes = select_keyframes(run, config.keyframes)
     state = Forward(run, model, keyframes, keep_past=keep_past)
-    with progress.stage("filter-ct" if context else "filter-t", total=len(keyframes)) as stage:
+    with progress.stage("filter-ct" if context else "filter-t", total=len(keyframes)) as stage, state.team:
         images = observations(run, keyframes, config.seed)
         for _ in keyframes:
             with timed(stage, "images"):
@@ -83,11 +86,10 @@ class Forward:
     def __init__(self, run: Run, model: Model, keyframes: NDArray[np.int64], *, keep_past: bool = False) -> None:
         self.model = model
         self.keyframes = keyframes
-        self.proposer = Proposer(model)
+        self.hand = Hand(model, run.localisation, keep_past=keep_past)
+        self.team = Team(self.hand)
         self.associator = Associator(model.config.frontend, model.catalogue)
         self.place = Place(run)
-        self.updater = Updater(model, self.proposer, run.localisation, keep_past=keep_past)
-        self.reporter = Reporter(model, self.proposer, run.localisation)
         self.beliefs: dict[int, Belief] = {}
         self.owner: dict[int, int] = {}
         """track -> object"""
@@ -120,34 +122,46 @@ class Forward:
             self.associator.step(observation)
             self.place.update(observation)
             self.surfaces.append(self.place.surfaces)
+        boxes = len(observation.frame.detections)
+        self.team.grow(max(len(self.beliefs), boxes), len(self.keyframes) - observation.keyframe)
         before = self.reports[-1] if self.reports else {}
-        surroundings = self.surroundings(before)
         tracks = self.associator.tracks()
-        reported: dict[int, Reported] = {}
-        for i, detection in self._detections(tracks, observation).items():
-            around = surroundings.without(i)
-            with self._counted(i, stage, "objects"):
-                belief = self.beliefs[i] = self.updater.step(self.beliefs[i], detection, observation, around)
-            # what nobody sees is believed to be as it was
-            unseen = not belief.visible and i in before
-            with timed(stage, "reports"):
-                if unseen:
-                    reported[i] = replace(before[i], visible=False, ledger=())
-                else:
-                    reported[i] = self.reporter.report(belief, around, before.get(i))
+        reported = self._step(self._detections(tracks, observation), observation, before, stage)
         new = [t for t in tracks if t.track_id not in self.owner]
         reported = self._start(new, observation, reported, before, stage)
         self.known |= {i: r.class_probability for i, r in reported.items() if r.existence > WAS_THERE}
         self.reports.append(self._find_moved(self._merge(reported)))
         self._remember(self.reports[-1])
 
-    @contextmanager
-    def _counted(self, i: int, stage: Stage, part: str) -> Iterator[None]:
-        """A block that works on one object: its hypotheses and seconds are told."""
-        before = self.proposer.hypotheses_scored
-        with timed(stage, part):
-            yield
-        self.scored.add(i, self.proposer.hypotheses_scored - before)
+    def _step(
+        self,
+        detections: Mapping[int, Detection | None],
+        observation: Observation,
+        before: Mapping[int, Reported],
+        stage: Stage,
+    ) -> dict[int, Reported]:
+        """Every object by its detection, beside what stood there before: what is said of them."""
+        steps = [Step(without_past(self.beliefs[i]), box, before.get(i)) for i, box in detections.items()]
+        scene = Scene(observation, self.surroundings(before))
+        worth = [self._worth(i, box, observation) for i, box in detections.items()]
+        done = self.team.do(steps, worth, scene, stage)
+        self._count(list(detections), done)
+        for i, one in zip(detections, done, strict=True):
+            self.beliefs[i] = with_past(one.answer[0], self.beliefs[i])
+        return {i: one.answer[1] for i, one in zip(detections, done, strict=True)}
+
+    def _worth(self, i: int, detection: Detection | None, observation: Observation) -> float:
+        """How dear a step will be, about: as the last one, and more where a search is due; out of view nothing."""
+        belief = self.beliefs[i]
+        if not self.hand.updater.sees(belief, detection, observation):
+            return 0.0
+        due = detection is not None and belief.steps - belief.searched >= self.model.config.filter.search_every
+        return (1.0 + self.scored.last(i)) * (_SEARCH if due else 1.0)
+
+    def _count(self, objects: Sequence[int], done: Sequence[Done[Any]]) -> None:
+        """Take down what was scored for objects."""
+        for i, one in zip(objects, done, strict=True):
+            self.scored.add(i, one.hypotheses)
 
     def _detections(self, tracks: tuple[Track, ...], observation: Observation) -> dict[int, Detection | None]:
         """Every object's detection, the surest where several of its tracks have one.
@@ -159,7 +173,7 @@ class Forward:
             i, detection = self.owner.get(track.track_id), track.at(observation.keyframe)
             if i is None or detection is None:
                 continue
-            if i != track.track_id and not self.updater.covers(self.beliefs[i], detection, observation):
+            if i != track.track_id and not self.hand.updater.covers(self.beliefs[i], detection, observation):
                 del self.owner[track.track_id]
                 continue
             other = out[i]
@@ -180,20 +194,17 @@ class Forward:
         They know no neighbours among themselves yet, so all start a second time beside those that were sure of
         themselves.
         """
-        started: dict[int, Belief] = {}
+        objects = [track.track_id for track in new]
+        found = self._search(new, Scene(observation, self.surroundings(before)), stage)
         fresh: dict[int, Reported] = {}
-        alone = self.surroundings(before)
-        found = {}
-        for track in new:
-            with self._counted(track.track_id, stage, "new objects"):
-                found[track.track_id] = self.updater.search(track, observation, alone)
+        started: dict[int, Belief] = {}
         for _ in range(2 if len(new) > 1 else 1):
-            surroundings = self.surroundings({**before, **fresh})
-            for track in new:
-                i = track.track_id
-                with self._counted(i, stage, "new objects"):
-                    started[i] = self.updater.start(track, observation, surroundings.without(i), found[i])
-            fresh = {i: self.reporter.report(belief, surroundings.without(i)) for i, belief in started.items()}
+            scene = Scene(observation, self.surroundings({**before, **fresh}))
+            starts = [Start(track, modes) for track, modes in zip(new, found, strict=True)]
+            done = self.team.do(starts, [1.0] * len(new), scene, stage)
+            self._count(objects, done)
+            started = {i: one.answer[0] for i, one in zip(objects, done, strict=True)}
+            fresh = {i: one.answer[1] for i, one in zip(objects, done, strict=True)}
         there = dict(reported)
         for i, report in fresh.items():
             known = at_place(report, there, self.model)
@@ -203,6 +214,15 @@ class Forward:
                 self.beliefs[owner] = replace(started[i], object_id=owner, past=past)
                 there[owner] = report
         return there
+
+    def _search(self, new: list[Track], scene: Scene, stage: Stage) -> list[tuple[PoseModes, ...]]:
+        """What is found of each track, of each class."""
+        each = [(track, shape) for track in new for shape in self.model.shapes]
+        searches = [Search(track, shape.index) for track, shape in each]
+        done = self.team.do(searches, [shape.reach_m for _, shape in each], scene, stage)
+        self._count([track.track_id for track, _ in each], done)
+        n = len(self.model.shapes)
+        return [tuple(one.answer for one in done[n * k : n * (k + 1)]) for k in range(len(new))]
 
     def _merge(self, reported: dict[int, Reported]) -> dict[int, Reported]:
         """Objects of one class that have come to one place go on as the older, with what has more evidence."""

@@ -95,14 +95,9 @@ class Updater:
         self.localisation = localisation
         self.keep_past = keep_past
 
-    def search(self, track: Track, observation: Observation, around: Surroundings) -> tuple[PoseModes, ...]:
-        """A full search for a track that has just become consistent: what was found of each class."""
+    def search(self, track: Track, shape: Shape, observation: Observation, around: Surroundings) -> PoseModes:
+        """A full search for a track that has just become consistent: what was found of one class."""
         view = self._first_view(track, observation, around)
-        return tuple(self._search(track, shape, view, observation, around) for shape in self.model.shapes)
-
-    def _search(
-        self, track: Track, shape: Shape, view: View, observation: Observation, around: Surroundings
-    ) -> PoseModes:
         rng = self._rng("filter.search", track.track_id, observation, shape)
         starts = self.proposer.search(shape, view, observation, around, rng)
         return self.proposer.modes(shape, view, starts, probe=False)
@@ -110,7 +105,7 @@ class Updater:
     def start(
         self, track: Track, observation: Observation, around: Surroundings, found: tuple[PoseModes, ...]
     ) -> Belief:
-        """The belief of a track that has just become consistent, from what `search` found of it."""
+        """The belief of a track that has just become consistent, from what `search` found of each class."""
         view = self._first_view(track, observation, around)
         n = len(self.model.shapes)
         score_sum = np.sum([self.model.class_scores(d) for d in track.detections], axis=0)
@@ -221,6 +216,10 @@ class Updater:
     def _where(self, belief: Belief, detection: Detection | None, observation: Observation) -> Array | None:
         """The box to look in: the detection's, or where the most probable class would appear; None out of view."""
         return self._outline(belief, observation) if detection is None else np.array(detection.box)
+
+    def sees(self, belief: Belief, detection: Detection | None, observation: Observation) -> bool:
+        """Whether an object is in view at a keyframe, so that a step has something to do."""
+        return detection is not None or self._outline(belief, observation) is not None
 
     def covers(self, belief: Belief, detection: Detection, observation: Observation) -> bool:
         """Whether a box overlaps at all with where the object would appear."""

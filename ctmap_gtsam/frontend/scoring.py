@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
@@ -45,6 +46,10 @@ class Tile:
         default_factory=dict, init=False, repr=False, compare=False
     )
     """parameters -> what all hypotheses of the tile share: worked out once, it is scored many times"""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Sent without what is worked out again: seven times the rest."""
+        return Tile, (self.camera, self.depth, self.background, self.x, self.y, self.step)
 
     def without_object(self, parameters: tuple[float, ...]) -> tuple[Array, Array]:
         """What a sample says without the object (h w, 6), and the log ratio where it is seen past (h w,)."""

@@ -19,13 +19,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
 
-_ONE_THREAD = (
-    "NUMBA_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
+from ctmap_gtsam.runtime.threads import ONE_THREAD
 
 
 class Job(Protocol):
@@ -93,8 +87,8 @@ def _context(imports: Sequence[str]) -> Any:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """What is started meanwhile has one thread in every library."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:

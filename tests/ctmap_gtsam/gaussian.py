@@ -87,7 +87,8 @@ def coordinates(T):
 def begun(updater, track, observation):
     """The belief of a new track that nothing surrounds."""
     nothing = Surroundings((), ())
-    return updater.start(track, observation, nothing, updater.search(track, observation, nothing))
+    found = tuple(updater.search(track, shape, observation, nothing) for shape in updater.model.shapes)
+    return updater.start(track, observation, nothing, found)
 
 
 def observation_at(k, detection, time_s=None):

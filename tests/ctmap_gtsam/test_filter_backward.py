@@ -1,5 +1,6 @@
 """Laws of the backward pass: where all is Gaussian it is Rauch, Tung and Striebel's, and the end is the filter's."""
 
+import pickle
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,6 +12,7 @@ from ctmap_gtsam.filtering.backward import Tracer, _Line, _Link, backward_run, l
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.history import Kept, Past, Stage, one_past
 from ctmap_gtsam.filtering.particles import Particles, Spread, Transition
+from ctmap_gtsam.filtering.tasks import with_past, without_past
 from ctmap_gtsam.filtering.updating import Updater
 from ctmap_gtsam.frontend.association import Track
 from ctmap_gtsam.frontend.surroundings import Surroundings
@@ -297,3 +299,22 @@ def test_what_was_first_seen_in_a_later_visit_is_not_claimed_for_an_earlier_one(
     mug = int(np.argmin(np.linalg.norm(smoothed.pose[:, -1, :3, 3] - truth["mug"][:3, 3], axis=-1)))
     assert (smoothed.existence[mug, :4] == 0.0).all()
     assert (smoothed.existence[mug, 4:] > 0.9).all()
+
+
+def test_a_past_that_stayed_behind_is_joined_again():
+    """A belief is sent to another process without it: what comes back has one keyframe more."""
+    model = Model(classes("mug"), config_of(), context=False)
+    measured, covariance = measurements(np.random.default_rng(5))
+    updater = Updater(model, GaussianProposer(measured, covariance), LocalisationNoise(), keep_past=True)
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    whole = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection))
+    for k in range(1, 4):
+        sent = pickle.loads(pickle.dumps(without_past(whole)))
+        assert sent.past.stages == ()
+        apart = with_past(updater.step(sent, detection, observation_at(k, detection), Surroundings((), ())), whole)
+        whole = updater.step(whole, detection, observation_at(k, detection), Surroundings((), ()))
+        assert apart.past.begin == whole.past.begin
+        assert [stage.keyframe for stage in apart.past.stages] == list(range(k + 1))
+        for own, other in zip(apart.past.stages, whole.past.stages, strict=True):
+            np.testing.assert_array_equal(own.classes[0].pose, other.classes[0].pose)
+            np.testing.assert_array_equal(own.classes[0].log_weight, other.classes[0].log_weight)

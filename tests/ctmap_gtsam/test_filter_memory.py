@@ -69,7 +69,8 @@ def mug_lost(model):
     updater = Updater(model, Proposer(model), LocalisationNoise())
     first = seen(0)
     track = Track(0, (0,), (first.frame.detections[0],), 0)
-    belief = updater.start(track, first, ALONE, updater.search(track, first, ALONE))
+    found = tuple(updater.search(track, shape, first, ALONE) for shape in updater.model.shapes)
+    belief = updater.start(track, first, ALONE, found)
     assert np.argmax(belief.class_log_evidence(model)) == MUG.index
     far_off = se3.make(TRUTH[:3, :3], TRUTH[:3, 3] + [0.0, 0.0, 0.08])
     lost = ClassBelief(Particles(np.tile(far_off, (24, 1, 1)), np.full(24, -np.log(24.0))), -200.0)

@@ -13,7 +13,9 @@ import pytest
 from ctmap_gtsam.comparing import run_methods
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
+from ctmap_gtsam.filtering import team
 from ctmap_gtsam.methods import METHODS
+from ctmap_gtsam.runtime.crew import Crew, possible
 from sequences import se3
 from sequences.bop import load_run, load_truth
 from sequences.simulation import (
@@ -155,6 +157,36 @@ def test_the_number_of_threads_changes_nothing(scene, method, tmp_path):
     finally:
         numba.set_num_threads(before)
     assert answers[0] == answers[1]
+
+
+@pytest.fixture
+def always_a_crew(monkeypatch):
+    """Two processes from the first keyframe on, which do all that can be sent: the jobs that they were given."""
+    given = []
+    do = Crew.do
+
+    def waiting(crew, shared, jobs, here):
+        given.extend(jobs)
+        return do(crew, shared, jobs)
+
+    monkeypatch.setattr(Crew, "do", waiting)
+    monkeypatch.setattr(team, "cores", lambda: 2)
+    monkeypatch.setattr(team, "LEAST_OBJECTS", 1)
+    monkeypatch.setattr(team, "LEAST_WORK", 0)
+    return given
+
+
+@pytest.mark.skipif(not possible(), reason="no processes beside this one on this system")
+def test_the_number_of_processes_changes_nothing(simulated, always_a_crew, tmp_path):
+    methods = ("filter-ct", "ffbsi-ct")
+    with pytest.MonkeyPatch.context() as alone:
+        alone.setattr(team, "cores", lambda: 1)
+        known = estimates_of(load_run(simulated), methods, CONFIG)
+    assert not always_a_crew
+    beside = estimates_of(load_run(simulated), methods, CONFIG)
+    assert {type(task).__name__ for task in always_a_crew} == {"Step", "Search", "Start"}
+    for method in methods:
+        assert stored(beside[method], tmp_path) == stored(known[method], tmp_path)
 
 
 @each_of_three

@@ -40,7 +40,7 @@ class Measured:
     each_s: tuple[float, ...]
     """of each step of the first stage: the filter's keyframes"""
     peak_mb: float
-    """most memory held at once, megabytes"""
+    """most memory held at once, megabytes; by the process alone, not by those that the filter has beside it"""
     objects: int
     """in the estimate"""
 
