@@ -94,10 +94,13 @@ class Belief:
 
     def class_log_evidence(self, model: Model) -> Array:
         """(C,) log evidence of each class at this place, prior included."""
-        scores = self.score_evidence + model.class_evidence(self.score_sum)
-        return model.between_classes(self.explained) + scores - np.log(len(self.classes))
+        return model.between_classes(self.explained) + self.called(model) - np.log(len(self.classes))
 
     @property
     def explained(self) -> Array:
         """(C,) what depth and boxes say of each class's poses so far; -inf where there are none."""
         return np.array([-np.inf if c is None else c.log_evidence for c in self.classes])
+
+    def called(self, model: Model) -> Array:
+        """(C,) log evidence of what the detector has called it, in all visits."""
+        return self.score_evidence + model.class_evidence(self.score_sum)

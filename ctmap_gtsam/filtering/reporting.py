@@ -139,7 +139,7 @@ class Reporter:
             weighted.append(Particles(own.particles.T_world_centre, mixture.normalised(joint)))
         # a solid thing can't be where another or a surface is: context decides on existence, too
         there = float(log_sum(log_evidence + context))
-        scores = belief.score_evidence + self.model.class_evidence(belief.score_sum)
+        scores = belief.called(self.model)
         posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
         rivals = (belief.log_clutter, belief.witness, 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)

@@ -205,11 +205,10 @@ class Updater:
         """A new visit: the detector's persistent belief of the last one has said what it had to say."""
         if observation.frame.visit == belief.visit:
             return belief
-        evidence = belief.score_evidence + self.model.class_evidence(belief.score_sum)
         return replace(
             belief,
             visit=observation.frame.visit,
-            score_evidence=evidence,
+            score_evidence=belief.called(self.model),
             score_sum=np.zeros_like(belief.score_sum),
         )
 
@@ -316,7 +315,7 @@ class Updater:
 
         Where depth says another, or nothing that clutter wouldn't, its pose may not have been found.
         """
-        return int(np.argmax(belief.score_evidence + self.model.class_evidence(belief.score_sum)))
+        return int(np.argmax(belief.called(self.model)))
 
     def _standard(self, belief: Belief, best: int) -> _Standard | None:
         own = belief.classes[best]
