@@ -15,7 +15,6 @@ from ctmap_gtsam.config import Config
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering import team
 from ctmap_gtsam.methods import METHODS
-from ctmap_gtsam.runtime.crew import Crew, possible
 from sequences import se3
 from sequences.bop import load_run, load_truth
 from sequences.simulation import (
@@ -160,31 +159,32 @@ def test_the_number_of_threads_changes_nothing(scene, method, tmp_path):
 
 
 @pytest.fixture
-def always_a_crew(monkeypatch):
-    """Two processes from the first keyframe on, which do all that can be sent: the jobs that they were given."""
+def always_another(monkeypatch):
+    """A process beside this one from the first keyframe on, which does all that can be sent: what it was given."""
     given = []
-    do = Crew.do
+    do = team._Beside.do
 
-    def waiting(crew, shared, jobs, here):
-        given.extend(jobs)
-        return do(crew, shared, jobs)
+    def waiting(beside, tasks, scene, here):
+        given.extend(tasks)
+        beside._there.result()
+        return do(beside, tasks, scene, here)
 
-    monkeypatch.setattr(Crew, "do", waiting)
+    monkeypatch.setattr(team._Beside, "do", waiting)
+    monkeypatch.setattr(team._Beside, "_room", lambda beside, left: 1000)
     monkeypatch.setattr(team, "cores", lambda: 2)
     monkeypatch.setattr(team, "LEAST_OBJECTS", 1)
     monkeypatch.setattr(team, "LEAST_WORK", 0)
     return given
 
 
-@pytest.mark.skipif(not possible(), reason="no processes beside this one on this system")
-def test_the_number_of_processes_changes_nothing(simulated, always_a_crew, tmp_path):
+def test_the_number_of_processes_changes_nothing(simulated, always_another, tmp_path):
     methods = ("filter-ct", "ffbsi-ct")
     with pytest.MonkeyPatch.context() as alone:
         alone.setattr(team, "cores", lambda: 1)
         known = estimates_of(load_run(simulated), methods, CONFIG)
-    assert not always_a_crew
+    assert not always_another
     beside = estimates_of(load_run(simulated), methods, CONFIG)
-    assert {type(task).__name__ for task in always_a_crew} == {"Step", "Search", "Start"}
+    assert {type(task).__name__ for task in always_another} == {"Step", "Search", "Start"}
     for method in methods:
         assert stored(beside[method], tmp_path) == stored(known[method], tmp_path)
 
