@@ -65,8 +65,11 @@ def interval(weights, means, sigmas, level=0.95):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_mug_with_its_handle_hidden_may_be_turned_and_with_it_in_sight_may_not(seed):
-    """From 24 degrees of views the handle can hide in 50; 95 % of the belief leave 40 of them open."""
-    config = config_of(f"seed={seed}")
+    """From 24 degrees of views the handle can hide in 50; 95 % of the belief leave 40 of them open.
+
+    With twice the default's particles: with those it hangs on the seed and the processor's rounding, and is 35 to 50.
+    """
+    config = config_of(f"seed={seed}", "filter.particles=600")
     run, T = mug_run(HIDDEN, seed)
     low, high = interval(*yaws(filter_run(run, config), T))
     assert high - low > 40.0

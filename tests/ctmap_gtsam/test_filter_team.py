@@ -205,7 +205,9 @@ def test_a_process_that_is_killed_is_an_error_and_nobody_waits():
 
 
 SCRIPT = """
+import signal
 from tests.ctmap_gtsam.test_filter_team import beside, refused
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background has it ignored
 with beside(1) as ours:
     print(ours.do([("who",)], None, refused)[0].answer[0], flush=True)
     ours.do([("sleep",)], None, refused)
