@@ -30,22 +30,16 @@ def write_together(files: Mapping[Path, bytes]) -> None:
 
     Raises OSError where one can't be written; then none has changed.
     """
-    ready: list[tuple[Path, Path]] = []
+    ready: dict[Path, Path] = {}
     try:
         for path, data in files.items():
-            path = Path(path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            ready.append((Path(temporary), path))
-            with os.fdopen(handle, "wb") as stream:
+            with _beside(Path(path)) as (stream, made):
+                ready[made] = Path(path)
                 stream.write(data)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.chmod(temporary, 0o666 & ~_umask())
-        for made, target in ready:
+        for made, target in ready.items():
             os.replace(made, target)
     except BaseException:
-        for made, _ in ready:
+        for made in ready:
             made.unlink(missing_ok=True)
         raise
 
@@ -57,17 +51,29 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     Raises OSError where the folder can't be written.
     """
     path = Path(path)
+    with _beside(path) as (stream, made):
+        yield stream
+    try:
+        os.replace(made, path)
+    except BaseException:
+        made.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """A stream into a new file beside `path`, and that file: whole on the disk where the block ends, else gone."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    made = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            yield stream
+            yield stream, made
             stream.flush()
             os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        made.chmod(0o666 & ~_umask())
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        made.unlink(missing_ok=True)
         raise
 
 
@@ -88,15 +94,13 @@ def json_bytes(value: Any) -> bytes:
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Arrays as one compressed .npz without pickle, whole or not at all; the same arrays give the same bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
+    with replacing(path) as stream, zipfile.ZipFile(stream, "w") as archive:
         for name in sorted(arrays):
             data = io.BytesIO()
             np.lib.format.write_array(data, np.asanyarray(arrays[name]), allow_pickle=False)
             # np.savez stamps the time of day; what an entry's own info doesn't say of compression counts as none
             entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             archive.writestr(entry, data.getvalue(), zipfile.ZIP_DEFLATED)
-    write_bytes(path, buffer.getvalue())
 
 
 def replace_folder(new: Path, target: Path) -> None:

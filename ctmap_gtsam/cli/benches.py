@@ -183,7 +183,7 @@ def filter_(
     """The filter's keyframes a second against objects, particles and the length of the run, and its memory (synthetic).
 
     A camera goes round a table, 640 x 480; 5 to 40 things are in view all the time. The whole takes most of an hour;
-    --keep holds what was measured, for this version alone. Seconds are CPU seconds.
+    --keep holds what was measured; what another version took is measured again. Seconds are CPU seconds.
 
     Example: `ctmap bench filter --quick --json filter.json`
     """

@@ -99,6 +99,17 @@ class Team:
         return every
 
 
+def _tell(stage: Stage, answers: Sequence[Done[Any]], seconds: float) -> None:
+    """Tell a stage of seconds by the clock, by the parts that workers spent their own on."""
+    spent: dict[str, float] = {}
+    for done in answers:
+        for part, own in done.seconds.items():
+            spent[part] = spent.get(part, 0.0) + own
+    total = sum(spent.values())
+    for part, own in spent.items():
+        stage.spent(part, seconds * own / total)
+
+
 class _Beside:
     """Processes beside this one, each with a hand of its own and one thread, started while this one goes on."""
 
@@ -223,14 +234,3 @@ def _scene(file: Path) -> Scene:
 
 def _do(file: Path, task: Task[Answer_co]) -> Done[Answer_co]:
     return _hand(_scene(file), task)
-
-
-def _tell(stage: Stage, answers: Sequence[Done[Any]], seconds: float) -> None:
-    """Tell a stage of seconds by the clock, by the parts that workers spent their own on."""
-    spent: dict[str, float] = {}
-    for done in answers:
-        for part, own in done.seconds.items():
-            spent[part] = spent.get(part, 0.0) + own
-    total = sum(spent.values())
-    for part, own in spent.items():
-        stage.spent(part, seconds * own / total)

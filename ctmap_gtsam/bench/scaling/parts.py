@@ -13,16 +13,14 @@ from ctmap_gtsam.bench.scaling.loop import write_loop
 from ctmap_gtsam.bench.scaling.measuring import Measured, measure, with_particles
 from ctmap_gtsam.config import Config
 from ctmap_gtsam.runtime.settings import to_dict
+from ctmap_gtsam.runtime.sources import code
 from sequences.atomic import write_json
 from sequences.progress import Progress
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Where runs and what they took are kept.
-
-    Whatever another version of the code measured there is taken for this one's.
-    """
+    """Where runs and what they took are kept: what was taken with other settings or code counts as missing."""
 
     folder: Path
     config: Config
@@ -42,7 +40,8 @@ class Parts:
         name = (
             f"{method}-{objects}-objects-{keyframes}-keyframes{'' if particles is None else f'-{particles}-particles'}"
         )
-        path, of = self.folder / f"{name}.json", {"config": to_dict(config), "round_frames": self.round_frames}
+        of = {"config": to_dict(config), "round_frames": self.round_frames, "code": code().estimating}
+        path = self.folder / f"{name}.json"
         kept = json.loads(path.read_text()) if path.is_file() else {}
         if kept.get("of") != json.loads(json.dumps(of)):
             with self.progress.stage(name):
