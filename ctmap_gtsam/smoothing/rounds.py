@@ -50,7 +50,7 @@ def neighbours_of(things: Mapping[int, Thing], keyframe: int, model: Model) -> t
     """The objects that are surely there at a keyframe."""
     there = ((thing, thing.present_pose(keyframe)) for thing in things.values())
     return tuple(
-        Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.log_evidence)
+        Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.claim_at(keyframe))
         for thing, pose in there
         if pose is not None
     )
