@@ -231,6 +231,14 @@ class Thing:
             return np.zeros((0, 4, 4))
         return self.stages[c][i].T_world_centre
 
+    def modes_beside(self, c: int, keyframe: int) -> Array:
+        """(n, 4, 4) T_world_centre of the modes of class c in the views before and after a keyframe that is one."""
+        i = self.view_at(keyframe)
+        if c not in self.stages or i == len(self.keyframes) or self.keyframes[i] != keyframe:
+            return np.zeros((0, 4, 4))
+        beside = self.stages[c][max(i - 1, 0) : i] + self.stages[c][i + 1 : i + 2]
+        return np.concatenate([np.zeros((0, 4, 4)), *(stage.T_world_centre for stage in beside)])
+
     def to_start_from(self) -> Thing:
         """The same without what only its graph and the estimate ask for: sightings' modes, and stages' covariances.
 
