@@ -218,8 +218,8 @@ class Proposer:
             probe: whether to climb along the axes on the score, and to take covariances from its shape (else from the
                 registration's normal equations).
             ways_round: whether the best is tried as turned by each of the class's near-symmetries and about what
-                shows of it, too, and the best of each is kept: all views decide which way round it stands, not which
-                ways were tried.
+                shows of it, too, and the best of each is kept, and ways that fit all but equally well have as many
+                modes each: all views decide which way round it stands, not which ways were tried.
         """
         if len(starts) == 0:
             return _no_modes()
@@ -228,13 +228,13 @@ class Proposer:
         starts = np.concatenate([starts, ways])
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
-        keep = self._distinct(shape, candidates, score, ways)
+        keep = self._distinct(shape, candidates, score, ways, ways_round)
         known: dict[int, Array] = {}
         if probe and view.detection is not None:
             climbed, known = self._climb(shape, view, candidates[keep])
             candidates = np.concatenate([climbed, candidates[keep]])
             score, scores = self.score(shape, view, candidates)
-            keep = self._distinct(shape, candidates, score, ways)
+            keep = self._distinct(shape, candidates, score, ways, ways_round)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe, [known.get(row) for row in keep])
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
@@ -394,10 +394,10 @@ class Proposer:
         turned = T[:, None] @ there[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3)) @ se3.inverse(there)[:, None]
         return turned.reshape(-1, 4, 4)
 
-    def _distinct(self, shape: Shape, poses: Array, score: Array, ways: Array) -> list[int]:
-        """Rows of the best few poses (n, 4, 4), and beside those of the best that is turned as each of (t, 4, 4)."""
+    def _distinct(self, shape: Shape, poses: Array, score: Array, ways: Array, turns: bool) -> list[int]:
+        """Rows of the best few poses (n, 4, 4), in turn or not, and those of the best turned as each of (t, 4, 4)."""
         rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
-        kept = in_turn(shape, poses, score, rows)[: self.settings.max_modes]
+        kept = (in_turn(shape, poses, score, rows) if turns else rows)[: self.settings.max_modes]
         for way in ways:
             there = symmetry.near(way, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
             if there.any() and rows[int(np.argmax(there))] not in kept:
