@@ -139,7 +139,11 @@ class Frontend:
 class Filter:
     """The particle filter, the paper's Algorithm 1."""
 
-    particles: int = option(300, "particles an object at most (the paper's M); a third of it in one place", low=10)
+    particles: int = option(
+        300,
+        "particles an object (the paper's M); a third in one place, four times as many where views leave it open",
+        low=10,
+    )
     min_particles: int = option(24, "of a class that is still possible", low=1)
     proposal_share: float = option(
         0.5, "particles drawn around refined modes rather than from the prediction", low=0.01, high=0.95

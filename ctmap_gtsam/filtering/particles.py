@@ -42,6 +42,10 @@ _GROWTHS = 8  # of a mode, at most
 _MEANS = 4  # fixed-point steps for a mean; poses of one mode need fewer than five
 _STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
 _MODES = 4  # of one class, at most
+_LIGHT = (
+    1e-3,
+    0.3,
+)  # weight, and share of the mean weight: a mode whose heaviest particle weighs less than both is none
 _SPARSE = 2.0  # a kernel so much wider than the prediction closes gaps that the prediction would leave
 _DIMENSIONS = 6
 _NOTHING = 40.0  # nats: what is so far behind the largest adds nothing to a sum in float64
@@ -50,6 +54,7 @@ _CELL = (0.15, 0.01)  # rad, metres: sides of the cells that a belief's spread i
 _DIVERGENCE = 0.02  # nats that the particles' histogram over cells is off by at most ...
 _SURE = 2.326  # ... with probability 0.99: its quantile of the normal distribution
 _LEAST_SHARE = 1.0 / 3.0  # of the configured particles: within a cell they still tell mean and covariance
+_STRETCHED = 4  # times as many where a mode stretches over cells: a tenth of them has any weight
 
 
 @dataclass(frozen=True)
@@ -258,15 +263,35 @@ def sufficient(particles: Particles, most: int, shape: Shape) -> int:
 
     Cells are counted about the heaviest particle, so that what lies close together is in one.
 
+    The bound is for draws from the belief itself. Of weighted ones a tenth count, and along a direction that no view
+    tells apart nothing mends what their noise has lost: it adds up from keyframe to keyframe. A heaviest mode that
+    `stretches` has `_STRETCHED` times the most.
+
     Args:
         particles: weighted.
-        most: the answer at most.
+        most: the answer at most, but for what stretches.
         shape: their class.
     """
+    if any(stretches(mode.covariance, shape) for mode in _modes(particles, shape, 1)):
+        return _STRETCHED * most
     rows = np.unique(systematic(particles.log_weight, most, 0.5))
     away = symmetry.residual(particles.best(1)[0], particles.T_world_centre[rows], shape.symmetry)
     cells = np.unique(np.round(away / np.repeat(_CELL, 3)).astype(np.int64), axis=0)
     return int(np.clip(kld_bound(len(cells)), round(_LEAST_SHARE * most), most))
+
+
+def stretches(covariance: Array, shape: Shape) -> bool:
+    """Whether a mode of a covariance (6, 6) reaches over cells: a standard deviation is longer than a cell's side."""
+    S = shape.symmetry
+    sides = np.repeat(_CELL, (3 - S.free, 3))
+    scaled = S.reduced_covariance(covariance) / np.outer(sides, sides)
+    return bool(np.linalg.eigvalsh(scaled)[-1] > 1.0)
+
+
+def first_count(proposals: Gaussians, most: int, shape: Shape) -> int:
+    """How many particles a belief that has no past is drawn with: `_STRETCHED` times the most if its mode stretches."""
+    heaviest = int(np.argmax(proposals.log_weight))
+    return _STRETCHED * most if stretches(proposals.covariance[heaviest], shape) else most
 
 
 def predicted_spread(model: Model, localisation: LocalisationNoise, dt_s: float, away_m: float) -> Spread:
@@ -311,9 +336,10 @@ def _modes(particles: Particles, shape: Shape, most: int) -> Iterator[_Mode]:
     spread that far: where nothing tells poses apart they are one mode, however far it reaches.
     """
     left, poses, S = particles.log_weight.copy(), particles.T_world_centre, shape.symmetry
+    least = np.log(min(_LIGHT[0], _LIGHT[1] / len(left)))
     for _ in range(most):
         heaviest = int(np.argmax(left))
-        if left[heaviest] < np.log(1e-3):
+        if left[heaviest] < least:
             return
         free = np.isfinite(left)
         r = symmetry.residual(poses[heaviest], poses, S)

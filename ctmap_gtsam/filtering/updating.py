@@ -18,6 +18,7 @@ from ctmap_gtsam.filtering.particles import (
     Spread,
     Transition,
     filled,
+    first_count,
     predict,
     predicted_log_density,
     predicted_spread,
@@ -427,6 +428,8 @@ class Updater:
             prior = filled(own.particles, change.spread, shape, rng)
             # what may have been moved may be anywhere
             count = count if np.isfinite(change.log_moved) else sufficient(prior, count, shape)
+        elif proposals is not None and own is None and count > settings.min_particles:
+            count = first_count(proposals, count, shape)
         n_proposed = round(share * count)
         if prior is not None and change is not None:
             drawn.append(predict(prior, count - n_proposed, change.spread, shape, rng))
