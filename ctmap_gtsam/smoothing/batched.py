@@ -7,16 +7,18 @@ call over arrays (`factors.terms`). GTSAM gets them as JacobianFactors, beside w
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ctmap_gtsam.smoothing.elimination import Blocks
 from factors.custom import FactorValueError
-from factors.terms import Terms
+from factors.terms import Linearised, Terms
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -34,6 +36,53 @@ class Batch:
     terms: Terms
     """of batch shape (n,)"""
 
+    def part(self, rows: slice) -> Batch:
+        """Some of them."""
+        return Batch(self.kind, self.names[rows], self.keys[rows], self.terms[rows])
+
+
+BLOCK = 100
+"""keyframes that are eliminated together, at least: a run that is shorter than two blocks is one"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Arrays:
+    """Values of all variables."""
+
+    poses: Array
+    """(P, 4, 4)"""
+    vectors: Array
+    """(V, 6)"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Consecutive factors of a batch that are in one block."""
+
+    batch: Batch
+    block: int
+    places: list[tuple[bool, Ints]]
+    """for each of a factor's keys whether it is a pose's, and (n,) where they are among the poses or the vectors"""
+
+    def errors(self, at: _Arrays) -> Array:
+        """(n,)"""
+        r, _ = self._linearised(at)
+        return np.asarray(0.5 * (r**2).sum(axis=-1))
+
+    def linearize(self, at: _Arrays, linear: Any) -> None:
+        """Add its factors to a gtsam.GaussianFactorGraph."""
+        r, jacobians = self._linearised(at)
+        noise = gtsam.noiseModel.Unit.Create(self.batch.terms.rows)
+        columns: list[Any] = []
+        for keys, J in zip(self.batch.keys.T, jacobians, strict=True):
+            columns += [keys.tolist(), J]
+        for factor in zip(*columns, -r, strict=True):
+            linear.add(*factor, noise)
+
+    def _linearised(self, at: _Arrays) -> Linearised:
+        arrays = [(at.poses if among_poses else at.vectors)[rows] for among_poses, rows in self.places]
+        return _checked(self.batch, *self.batch.terms.linearised(arrays))
+
 
 class Problem:
     """What the solver minimises: `error` and `linearize` are those of a gtsam.NonlinearFactorGraph of the same factors.
@@ -42,18 +91,33 @@ class Problem:
         compiled: gtsam.NonlinearFactorGraph of all factors that aren't in batches.
         batches: the others.
         values: gtsam.Values that holds all variables, poses and 6-vectors; what is evaluated later has the same keys.
+        keyframes: of keys (n,) the keyframe that each is of (n,), -1 for none; None = the system is eliminated at once.
+        block: keyframes that are eliminated together, at least.
     """
 
-    def __init__(self, compiled: Any, batches: Sequence[Batch], values: Any) -> None:
+    def __init__(
+        self,
+        compiled: Any,
+        batches: Sequence[Batch],
+        values: Any,
+        keyframes: Callable[[Ints], Ints] | None = None,
+        block: int = BLOCK,
+    ) -> None:
         self._compiled = compiled
-        self._batches = tuple(batches)
-        keys = list(values.keys())
-        is_pose = np.array([_is_pose(values, key) for key in keys], dtype=bool)
-        at = np.array(keys, dtype=np.int64)
+        keys = np.array(values.keys(), dtype=np.int64)
+        is_pose = np.array([_is_pose(values, key) for key in keys.tolist()], dtype=bool)
         # gtsam.Values is ordered by key, and so are the poses taken out of it
-        poses = at[is_pose]
-        self._vectors = at[~is_pose].tolist()
-        self._places = [[_place(column, poses, at[~is_pose]) for column in batch.keys.T] for batch in self._batches]
+        poses, vectors = keys[is_pose], keys[~is_pose]
+        self._vectors = vectors.tolist()
+        variables = [np.searchsorted(keys, own) for own in (_padded(compiled), *(batch.keys for batch in batches))]
+        first = _blocks_of(np.full(len(keys), -1) if keyframes is None else keyframes(keys), block)
+        (of_compiled, *of_batches), last = cut(first, variables)
+        self._own = [keys[last == n].tolist() for n in range(last.max(initial=0) + 1)]
+        self._compiled_in = [compiled] if len(self._own) == 1 else _split(compiled, of_compiled, len(self._own))
+        self._pieces = [
+            [_Piece(part, n, [_place(column, poses, vectors) for column in part.keys.T]) for n, part in _parts(batch, of)]
+            for batch, of in zip(batches, of_batches, strict=True)
+        ]
 
     def error(self, values: Any) -> float:
         """Sum of all factors' errors, nats but for constants."""
@@ -61,29 +125,93 @@ class Problem:
 
     def batch_errors(self, values: Any) -> list[Array]:
         """Each batch's errors (n,)."""
-        return [0.5 * (r**2).sum(axis=-1) for r, _ in self._linearised(values)]
+        at = self._read(values)
+        return [np.concatenate([piece.errors(at) for piece in pieces]) for pieces in self._pieces]
 
     def linearize(self, values: Any) -> Any:
         """A gtsam.GaussianFactorGraph, one factor a factor."""
-        linear = self._compiled.linearize(values)
-        for batch, (r, jacobians) in zip(self._batches, self._linearised(values), strict=True):
-            noise = gtsam.noiseModel.Unit.Create(batch.terms.rows)
-            columns: list[Any] = []
-            for keys, J in zip(batch.keys.T, jacobians, strict=True):
-                columns += [keys.tolist(), J]
-            for factor in zip(*columns, -r, strict=True):
-                linear.add(*factor, noise)
+        linear, at = self._compiled.linearize(values), self._read(values)
+        for pieces in self._pieces:
+            for piece in pieces:
+                piece.linearize(at, linear)
         return linear
 
-    def _linearised(self, values: Any) -> Iterator[tuple[Array, tuple[Array, ...]]]:
-        """Batch by batch: all Jacobians at once are as much again as the graph that is made of them."""
+    def blocks(self, values: Any) -> Blocks:
+        """The same, to be eliminated in blocks of keyframes."""
+        at = self._read(values)
+
+        def make(block: int) -> Any:
+            linear = self._compiled_in[block].linearize(values)
+            for pieces in self._pieces:
+                for piece in pieces:
+                    if piece.block == block:
+                        piece.linearize(at, linear)
+            return linear
+
+        return Blocks(self._own, make)
+
+    def _read(self, values: Any) -> _Arrays:
         rows = gtsam.utilities.extractPose3(values)
         poses = np.zeros((len(rows), 4, 4))
         poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:], 1.0
-        vectors = np.array([values.atVector(key) for key in self._vectors]).reshape(-1, 6)
-        for batch, places in zip(self._batches, self._places, strict=True):
-            arrays = [(poses if among_poses else vectors)[at] for among_poses, at in places]
-            yield _checked(batch, *batch.terms.linearised(arrays))
+        return _Arrays(poses, np.array([values.atVector(key) for key in self._vectors]).reshape(-1, 6))
+
+
+def cut(first: Ints, factors: Sequence[Ints]) -> tuple[list[Ints], Ints]:
+    """In which block each factor is, and in which each variable is eliminated: that of its last factor.
+
+    Args:
+        first: (V,) block of each variable, -1 for those that may be in any: they begin with their first factor.
+        factors: groups of n factors, (n, a) their variables among the V.
+
+    Returns:
+        For each group (n,), and (V,).
+    """
+    never = np.iinfo(np.int64).max
+    begins = np.where(first < 0, never, first)
+    for variables in factors:
+        block = first[variables].max(axis=1, initial=-1)
+        np.minimum.at(begins, variables[block >= 0], block[block >= 0, None])
+    begins = np.where(first >= 0, first, np.where(begins == never, 0, begins))
+    of_factors = [begins[variables].max(axis=1, initial=0) for variables in factors]
+    last = begins.copy()
+    for variables, block in zip(factors, of_factors, strict=True):
+        np.maximum.at(last, variables, block[:, None])
+    return of_factors, last
+
+
+def _blocks_of(keyframes: Ints, least: int) -> Ints:
+    """Block of each of some keyframes, which has so many or more; -1 for what is of none."""
+    timed = keyframes >= 0
+    if not timed.any():
+        return np.full(len(keyframes), -1)
+    begin = keyframes[timed].min()
+    n = int(keyframes.max() - begin) + 1
+    return np.where(timed, (keyframes - begin) * max(n // least, 1) // n, -1)
+
+
+def _padded(compiled: Any) -> Ints:
+    """(n, a) keys of a gtsam.NonlinearFactorGraph's factors, the first repeated where there are fewer."""
+    keys = [compiled.at(i).keys() for i in range(compiled.size())]
+    most = max((len(own) for own in keys), default=1)
+    return np.array([own + own[:1] * (most - len(own)) for own in keys], dtype=np.int64).reshape(-1, most)
+
+
+def _split(compiled: Any, blocks: Ints, n: int) -> list[Any]:
+    """The factors of each of n blocks."""
+    out = [gtsam.NonlinearFactorGraph() for _ in range(n)]
+    for i, block in enumerate(blocks.tolist()):
+        out[block].add(compiled.at(i))
+    return out
+
+
+def _parts(batch: Batch, blocks: Ints) -> Iterator[tuple[int, Batch]]:
+    """Block and factors of each run of factors that are in one block: views, no copies."""
+    if not len(blocks):
+        return
+    ends = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), len(blocks)]
+    for begin, end in pairwise(ends):
+        yield int(blocks[begin]), batch if end - begin == len(blocks) else batch.part(slice(begin, end))
 
 
 def _is_pose(values: Any, key: int) -> bool:
@@ -102,7 +230,7 @@ def _place(column: Ints, poses: Ints, vectors: Ints) -> tuple[bool, Ints]:
     return among_poses, np.searchsorted(keys, column)
 
 
-def _checked(batch: Batch, r: Array, jacobians: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+def _checked(batch: Batch, r: Array, jacobians: tuple[Array, ...]) -> Linearised:
     finite = np.isfinite(r).all(axis=-1)
     for J in jacobians:
         finite &= np.isfinite(J).all(axis=(-2, -1))

@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 _EXACT = np.repeat([1e-5, 1e-5], 3)
 """rad, metres: how well a camera pose is known that is recorded without error"""
 _STRIDE = 1_000_000
+_KIND, _INDEX = 56, 2**56 - 1  # of a gtsam.Symbol: the bit at which its letter begins, and those of its index
 _FURTHEST = 1e8  # ratio of variances of an object-visit's shared error
 
 
@@ -149,7 +150,7 @@ class SmootherGraph:
 
     def problem(self) -> Problem:
         """The same as the solver takes it."""
-        return Problem(self._compiled, self._batches, self.initial)
+        return Problem(self._compiled, self._batches, self.initial, keyframes_of)
 
     def to_gtsam(self) -> Any:
         """The same as a gtsam.NonlinearFactorGraph, with a CustomFactor for each that GTSAM has none for."""
@@ -308,6 +309,13 @@ def bias_key(row: int, visit: int) -> int:
     return int(gtsam.symbol("b", row * _STRIDE + visit))
 
 
+def keyframes_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keyframe of each of some keys (n,) of cameras and objects, -1 for b_iv."""
+    index = keys & _INDEX
+    kind = keys >> _KIND
+    return np.where(kind == ord("x"), index, np.where(kind == ord("o"), index % _STRIDE, -1))
+
+
 def build(
     model: Model,
     cameras: Sequence[Camera],
@@ -358,7 +366,7 @@ def smooth(
     solution = optimise(problem, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
     keys = [camera_key(k) for k in range(first, n)]
     keys += [object_key(row, m.keyframe) for row, (_, measured) in objects.items() for m in measured]
-    covariance_of = covariances(problem.linearize(solution.values), keys)
+    covariance_of = covariances(problem.blocks(solution.values), keys)
 
     def read(key: int) -> tuple[Array, Array]:
         return solution.values.atPose3(key).matrix(), covariance_of[key]
