@@ -109,14 +109,15 @@ class Problem:
         # gtsam.Values is ordered by key, and so are the poses taken out of it
         poses, vectors = keys[is_pose], keys[~is_pose]
         self._vectors = vectors.tolist()
-        variables = [np.searchsorted(keys, own) for own in (_padded(compiled), *(batch.keys for batch in batches))]
+        of_compiled = padded([compiled.at(i).keys() for i in range(compiled.size())])
+        variables = [np.searchsorted(keys, own) for own in (of_compiled, *(batch.keys for batch in batches))]
         first = _blocks_of(np.full(len(keys), -1) if keyframes is None else keyframes(keys), block)
-        (of_compiled, *of_batches), last = cut(first, variables)
+        (in_compiled, *in_batches), last = cut(first, variables)
         self._own = [keys[last == n].tolist() for n in range(last.max(initial=0) + 1)]
-        self._compiled_in = [compiled] if len(self._own) == 1 else _split(compiled, of_compiled, len(self._own))
+        self._compiled_in = [compiled] if len(self._own) == 1 else _split(compiled, in_compiled, len(self._own))
         self._pieces = [
-            [_Piece(part, n, [_place(column, poses, vectors) for column in part.keys.T]) for n, part in _parts(batch, of)]
-            for batch, of in zip(batches, of_batches, strict=True)
+            [_Piece(part, n, [_place(column, poses, vectors) for column in part.keys.T]) for n, part in _parts(batch, at)]
+            for batch, at in zip(batches, in_batches, strict=True)
         ]
 
     def error(self, values: Any) -> float:
@@ -190,11 +191,10 @@ def _blocks_of(keyframes: Ints, least: int) -> Ints:
     return np.where(timed, (keyframes - begin) * max(n // least, 1) // n, -1)
 
 
-def _padded(compiled: Any) -> Ints:
-    """(n, a) keys of a gtsam.NonlinearFactorGraph's factors, the first repeated where there are fewer."""
-    keys = [compiled.at(i).keys() for i in range(compiled.size())]
+def padded(keys: Sequence[Sequence[int]]) -> Ints:
+    """(n, a) keys of n factors, the first repeated where there are fewer than a."""
     most = max((len(own) for own in keys), default=1)
-    return np.array([own + own[:1] * (most - len(own)) for own in keys], dtype=np.int64).reshape(-1, most)
+    return np.array([[*own, *own[:1] * (most - len(own))] for own in keys], dtype=np.int64).reshape(-1, most)
 
 
 def _split(compiled: Any, blocks: Ints, n: int) -> list[Any]:

@@ -23,7 +23,7 @@ from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from ctmap_gtsam.smoothing.batched import Batch, Problem
+from ctmap_gtsam.smoothing.batched import Batch, Problem, padded
 from ctmap_gtsam.smoothing.footing import footings
 from ctmap_gtsam.smoothing.marginals import covariances
 from ctmap_gtsam.smoothing.solver import Solution, optimise
@@ -163,7 +163,10 @@ class SmootherGraph:
 
     def count(self) -> dict[str, int]:
         """Number of factors by kind."""
-        return dict(Counter(label.kind for label in self.labels))
+        count = Counter(label.kind for label in self._compiled_labels)
+        for batch in self._batches:
+            count[batch.kind] += len(batch.names)
+        return dict(count)
 
     def edges(self, values: Any) -> list[Edges]:
         """Measurements and predictions as relative poses, with symmetries and biases as they are at given values.
@@ -186,21 +189,30 @@ class SmootherGraph:
 
     def contributions(self, values: Any) -> Contributions:
         """What each factor says at given values, in the order of `labels`."""
-        labels = self.labels
-        variables = [[Variable.of(key) for key in label.keys] for label in labels]
-        begun: dict[Variable, int] = {}
-        for label, own in zip(labels, variables, strict=True):
-            if label.kind == "measurement":
-                begun[own[-1]] = min(own[0].index, begun.get(own[-1], own[0].index))
-        keyframes = [max(begun.get(v, 0) if v.kind == "b" else v.index for v in own) for own in variables]
-        objects = [[*sorted({v.row for v in own if v.row is not None}), -1, -1] for own in variables]
+        kinds = [label.kind for label in self._compiled_labels]
+        groups = [padded([label.keys for label in self._compiled_labels])]
+        for batch in self._batches:
+            kinds += [batch.kind] * len(batch.names)
+            groups.append(batch.keys)
+        begun = self._begun()
+        objects = np.concatenate([_lowest_rows(keys) for keys in groups])
         return Contributions(
-            kind=tuple(label.kind for label in labels),
-            object=np.array([those[0] for those in objects], dtype=np.int64),
-            keyframe=np.array(keyframes, dtype=np.int64),
-            other=np.array([those[1] for those in objects], dtype=np.int64),
+            kind=tuple(kinds),
+            object=objects[:, 0],
+            keyframe=np.concatenate([_latest(keys, begun) for keys in groups]),
+            other=objects[:, 1],
             nats=-self.errors(values),
         )
+
+    def _begun(self) -> dict[int, int]:
+        """b_iv -> the keyframe of its first measurement."""
+        begun: dict[int, int] = {}
+        for batch in self._batches:
+            if batch.kind == "measurement":
+                for bias in np.unique(batch.keys[:, -1]).tolist():
+                    first = int(keyframes_of(batch.keys[batch.keys[:, -1] == bias, 0]).min())
+                    begun[bias] = min(first, begun.get(bias, first))
+        return begun
 
     def energy(self, values: Any) -> dict[str, float]:
         """Error by kind at given values, nats."""
@@ -316,6 +328,31 @@ def keyframes_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(kind == ord("x"), index, np.where(kind == ord("o"), index % _STRIDE, -1))
 
 
+def _rows_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Object of each of some keys, -1 for cameras."""
+    return np.where(keys >> _KIND == ord("x"), -1, (keys & _INDEX) // _STRIDE)
+
+
+def _latest(keys: NDArray[np.int64], begun: Mapping[int, int]) -> NDArray[np.int64]:
+    """(n,) the latest keyframe of each factor's variables, by keys (n, a); b_iv is of the one that it begins with."""
+    keyframes = keyframes_of(keys)
+    timeless = keyframes < 0
+    keyframes[timeless] = [begun.get(key, 0) for key in keys[timeless].tolist()]
+    return np.asarray(keyframes.max(axis=1, initial=0))
+
+
+def _lowest_rows(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n, 2) the lowest two objects that each factor concerns, by its variables' keys (n, a); -1 for none."""
+    none = np.iinfo(np.int64).max
+    rows = _rows_of(keys)
+    rows[rows < 0] = none
+    first = rows.min(axis=1, initial=none)
+    second = np.where(rows > first[:, None], rows, none).min(axis=1, initial=none)
+    lowest = np.stack([first, second], axis=1)
+    lowest[lowest == none] = -1
+    return lowest
+
+
 def build(
     model: Model,
     cameras: Sequence[Camera],
@@ -367,6 +404,7 @@ def smooth(
     keys = [camera_key(k) for k in range(first, n)]
     keys += [object_key(row, m.keyframe) for row, (_, measured) in objects.items() for m in measured]
     covariance_of = covariances(problem.blocks(solution.values), keys)
+    del problem
 
     def read(key: int) -> tuple[Array, Array]:
         return solution.values.atPose3(key).matrix(), covariance_of[key]
