@@ -29,16 +29,15 @@ class Batch:
     """n factors of one kind and form."""
 
     kind: str
-    names: tuple[str, ...]
-    """(n,) what errors and tables call them"""
     keys: Ints
     """(n, a)"""
     terms: Terms
     """of batch shape (n,)"""
+    name: Callable[[Sequence[int]], str]
+    """what errors and tables call a factor of some keys (a,)"""
 
-    def part(self, rows: slice) -> Batch:
-        """Some of them."""
-        return Batch(self.kind, self.names[rows], self.keys[rows], self.terms[rows])
+    def __len__(self) -> int:
+        return len(self.keys)
 
 
 BLOCK = 100
@@ -46,13 +45,24 @@ BLOCK = 100
 
 
 @dataclass(frozen=True, eq=False)
-class _Arrays:
-    """Values of all variables."""
+class _Point:
+    """Values of all variables as arrays."""
 
+    pose_keys: Ints
+    """(P,) ascending"""
     poses: Array
     """(P, 4, 4)"""
+    vector_keys: Ints
+    """(V,) ascending"""
     vectors: Array
     """(V, 6)"""
+
+    def of(self, keys: Ints) -> Array:
+        """Values (n, 4, 4) or (n, 6) of some keys (n,), all of poses or all of vectors."""
+        rows = np.searchsorted(self.pose_keys, keys)
+        if (self.pose_keys[rows[:1] % len(self.pose_keys)] == keys[:1]).all():
+            return self.poses[rows]
+        return self.vectors[np.searchsorted(self.vector_keys, keys)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,28 +70,37 @@ class _Piece:
     """Consecutive factors of a batch that are in one block."""
 
     batch: Batch
+    rows: slice
     block: int
-    places: list[tuple[bool, Ints]]
-    """for each of a factor's keys whether it is a pose's, and (n,) where they are among the poses or the vectors"""
 
-    def errors(self, at: _Arrays) -> Array:
-        """(n,)"""
+    def errors(self, at: _Point) -> Array:
+        """Of each factor (n,)."""
         r, _ = self._linearised(at)
         return np.asarray(0.5 * (r**2).sum(axis=-1))
 
-    def linearize(self, at: _Arrays, linear: Any) -> None:
+    def linearize(self, at: _Point, linear: Any) -> None:
         """Add its factors to a gtsam.GaussianFactorGraph."""
         r, jacobians = self._linearised(at)
         noise = gtsam.noiseModel.Unit.Create(self.batch.terms.rows)
         columns: list[Any] = []
-        for keys, J in zip(self.batch.keys.T, jacobians, strict=True):
+        for keys, J in zip(self.batch.keys[self.rows].T, jacobians, strict=True):
             columns += [keys.tolist(), J]
         for factor in zip(*columns, -r, strict=True):
             linear.add(*factor, noise)
 
-    def _linearised(self, at: _Arrays) -> Linearised:
-        arrays = [(at.poses if among_poses else at.vectors)[rows] for among_poses, rows in self.places]
-        return _checked(self.batch, *self.batch.terms.linearised(arrays))
+    def _linearised(self, at: _Point) -> Linearised:
+        keys = self.batch.keys[self.rows]
+        whole = len(keys) == len(self.batch)
+        # what the terms of a part work out once is let go of with the part: of all parts it is as much as their numbers
+        terms = self.batch.terms if whole else self.batch.terms[self.rows]
+        r, jacobians = terms.linearised([at.of(column) for column in keys.T])
+        finite = np.isfinite(r).all(axis=-1)
+        for J in jacobians:
+            finite &= np.isfinite(J).all(axis=(-2, -1))
+        if not finite.all():
+            name = self.batch.name(keys[int(np.argmin(finite))].tolist())
+            raise FactorValueError(name, "residual or Jacobian", "has a value that isn't finite")
+        return r, jacobians
 
 
 class Problem:
@@ -107,17 +126,15 @@ class Problem:
         keys = np.array(values.keys(), dtype=np.int64)
         is_pose = np.array([_is_pose(values, key) for key in keys.tolist()], dtype=bool)
         # gtsam.Values is ordered by key, and so are the poses taken out of it
-        poses, vectors = keys[is_pose], keys[~is_pose]
-        self._vectors = vectors.tolist()
-        of_compiled = padded([compiled.at(i).keys() for i in range(compiled.size())])
+        self._poses, self._vectors = keys[is_pose], keys[~is_pose]
+        of_compiled = padded([tuple(compiled.at(i).keys()) for i in range(compiled.size())])
         variables = [np.searchsorted(keys, own) for own in (of_compiled, *(batch.keys for batch in batches))]
         first = _blocks_of(np.full(len(keys), -1) if keyframes is None else keyframes(keys), block)
         (in_compiled, *in_batches), last = cut(first, variables)
-        self._own = [keys[last == n].tolist() for n in range(last.max(initial=0) + 1)]
+        self._own = [keys[last == n] for n in range(last.max(initial=0) + 1)]
         self._compiled_in = [compiled] if len(self._own) == 1 else _split(compiled, in_compiled, len(self._own))
         self._pieces = [
-            [_Piece(part, n, [_place(column, poses, vectors) for column in part.keys.T]) for n, part in _parts(batch, at)]
-            for batch, at in zip(batches, in_batches, strict=True)
+            [_Piece(batch, rows, n) for rows, n in _runs(at)] for batch, at in zip(batches, in_batches, strict=True)
         ]
 
     def error(self, values: Any) -> float:
@@ -151,11 +168,12 @@ class Problem:
 
         return Blocks(self._own, make)
 
-    def _read(self, values: Any) -> _Arrays:
+    def _read(self, values: Any) -> _Point:
         rows = gtsam.utilities.extractPose3(values)
         poses = np.zeros((len(rows), 4, 4))
         poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:], 1.0
-        return _Arrays(poses, np.array([values.atVector(key) for key in self._vectors]).reshape(-1, 6))
+        vectors = np.array([values.atVector(key) for key in self._vectors.tolist()]).reshape(-1, 6)
+        return _Point(self._poses, poses, self._vectors, vectors)
 
 
 def cut(first: Ints, factors: Sequence[Ints]) -> tuple[list[Ints], Ints]:
@@ -191,10 +209,10 @@ def _blocks_of(keyframes: Ints, least: int) -> Ints:
     return np.where(timed, (keyframes - begin) * max(n // least, 1) // n, -1)
 
 
-def padded(keys: Sequence[Sequence[int]]) -> Ints:
+def padded(keys: Sequence[tuple[int, ...]]) -> Ints:
     """(n, a) keys of n factors, the first repeated where there are fewer than a."""
     most = max((len(own) for own in keys), default=1)
-    return np.array([[*own, *own[:1] * (most - len(own))] for own in keys], dtype=np.int64).reshape(-1, most)
+    return np.array([own + own[:1] * (most - len(own)) for own in keys], dtype=np.int64).reshape(-1, most)
 
 
 def _split(compiled: Any, blocks: Ints, n: int) -> list[Any]:
@@ -205,13 +223,11 @@ def _split(compiled: Any, blocks: Ints, n: int) -> list[Any]:
     return out
 
 
-def _parts(batch: Batch, blocks: Ints) -> Iterator[tuple[int, Batch]]:
-    """Block and factors of each run of factors that are in one block: views, no copies."""
-    if not len(blocks):
-        return
-    ends = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), len(blocks)]
-    for begin, end in pairwise(ends):
-        yield int(blocks[begin]), batch if end - begin == len(blocks) else batch.part(slice(begin, end))
+def _runs(blocks: Ints) -> Iterator[tuple[slice, int]]:
+    """Where consecutive factors are in one block, and in which."""
+    ends = np.flatnonzero(np.diff(blocks, prepend=-1, append=-1))
+    for begin, end in pairwise(ends.tolist()):
+        yield slice(begin, end), int(blocks[begin])
 
 
 def _is_pose(values: Any, key: int) -> bool:
@@ -221,20 +237,3 @@ def _is_pose(values: Any, key: int) -> bool:
     except RuntimeError:
         return False
     return True
-
-
-def _place(column: Ints, poses: Ints, vectors: Ints) -> tuple[bool, Ints]:
-    """Where a batch's keys (n,) are among the poses, or else among the vectors."""
-    among_poses = bool(np.isin(column, poses).all())
-    keys = poses if among_poses else vectors
-    return among_poses, np.searchsorted(keys, column)
-
-
-def _checked(batch: Batch, r: Array, jacobians: tuple[Array, ...]) -> Linearised:
-    finite = np.isfinite(r).all(axis=-1)
-    for J in jacobians:
-        finite &= np.isfinite(J).all(axis=(-2, -1))
-    if not finite.all():
-        name = batch.names[int(np.argmin(finite))]
-        raise FactorValueError(name, "residual or Jacobian", "has a value that isn't finite")
-    return r, jacobians

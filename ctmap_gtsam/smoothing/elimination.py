@@ -8,13 +8,14 @@ costs less than looking at one image. All is exact: the same normal equations, i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 LEVER_M = 0.1
 """how far from an object's centre its surface is, more or less: what a turn of a radian moves"""
@@ -24,8 +25,8 @@ LEVER_M = 0.1
 class Blocks:
     """A linear system over variables of 6 numbers, in blocks."""
 
-    own: Sequence[Sequence[int]]
-    """keys of each block: those that no factor of a later block has"""
+    own: Sequence[NDArray[np.int64]]
+    """keys of each block, ascending: those that no factor of a later block has"""
     make: Callable[[int], Any] = field(repr=False)
     """block -> gtsam.GaussianFactorGraph of its factors, whose variables are its own or later blocks'"""
 
@@ -35,7 +36,7 @@ class Blocks:
         return self.make(len(self.own) - 1)
 
     def graph(self, block: int, before: Any) -> Any:
-        """gtsam.GaussianFactorGraph of a block's factors, and of what the blocks before it say (gtsam.HessianFactor)."""
+        """gtsam.GaussianFactorGraph of a block's factors and of the message that it is handed."""
         if block < len(self.own) - 1:
             linear = self.make(block)
         else:
@@ -69,7 +70,7 @@ class Blocks:
     def _solve_back(self, block: int, message: Any, damping: float, step: Any) -> None:
         """Add a block's part to a step that holds all that comes after it."""
         linear = _damped(self.graph(block, message), self.own[block], damping)
-        net, _ = linear.eliminatePartialSequential(list(self.own[block]))
+        net, _ = linear.eliminatePartialSequential(self.own[block].tolist())
         for i in reversed(range(net.size())):
             step.insert(net.at(i).solve(step))
 
@@ -78,7 +79,7 @@ class Blocks:
         out = [None]
         for block, keys in enumerate(self.own[:-1]):
             linear = _damped(self.graph(block, out[-1]), keys, damping)
-            out.append(_as_one(linear.eliminatePartialMultifrontal(list(keys))[1]))
+            out.append(_as_one(linear.eliminatePartialMultifrontal(keys.tolist())[1]))
         return out
 
 
@@ -87,10 +88,10 @@ def _as_one(linear: Any) -> Any:
     return gtsam.HessianFactor(linear) if len(linear.keyVector()) else None
 
 
-def _damped(linear: Any, keys: Iterable[int], damping: float) -> Any:
+def _damped(linear: Any, keys: NDArray[np.int64], damping: float) -> Any:
     """Levenberg's damping on some variables, in a unit in which a radian weighs as much as `LEVER_M` metres."""
     if damping > 0.0:
         scale = np.sqrt(damping) * np.repeat([1.0, 1.0 / LEVER_M], 3)
-        for key in keys:
+        for key in keys.tolist():
             linear.add(key, np.diag(scale), np.zeros(6), gtsam.noiseModel.Unit.Create(6))
     return linear

@@ -121,6 +121,8 @@ class SmootherGraph:
     """gtsam.Values"""
     objects: dict[int, str] = field(default_factory=dict)
     """object -> its class's name"""
+    measured: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    """object -> the keyframes that it has a variable at, ascending"""
     _compiled: Any = field(default_factory=gtsam.NonlinearFactorGraph)
     _compiled_labels: list[Label] = field(default_factory=list)
     _batches: list[Batch] = field(default_factory=list)
@@ -143,9 +145,7 @@ class SmootherGraph:
     def labels(self) -> list[Label]:
         """What each factor is, in the order of `to_gtsam`."""
         return self._compiled_labels + [
-            Label(batch.kind, name, tuple(keys))
-            for batch in self._batches
-            for name, keys in zip(batch.names, batch.keys.tolist(), strict=True)
+            Label(batch.kind, batch.name(keys), tuple(keys)) for batch in self._batches for keys in batch.keys.tolist()
         ]
 
     def problem(self) -> Problem:
@@ -157,15 +157,15 @@ class SmootherGraph:
         graph = gtsam.NonlinearFactorGraph()
         graph.push_back(self._compiled)
         for batch in self._batches:
-            for i, (name, keys) in enumerate(zip(batch.names, batch.keys.tolist(), strict=True)):
-                graph.add(terms_factor(name, keys, batch.terms[i]))
+            for i, keys in enumerate(batch.keys.tolist()):
+                graph.add(terms_factor(batch.name(keys), keys, batch.terms[i]))
         return graph
 
     def count(self) -> dict[str, int]:
         """Number of factors by kind."""
         count = Counter(label.kind for label in self._compiled_labels)
         for batch in self._batches:
-            count[batch.kind] += len(batch.names)
+            count[batch.kind] += len(batch)
         return dict(count)
 
     def edges(self, values: Any) -> list[Edges]:
@@ -192,7 +192,7 @@ class SmootherGraph:
         kinds = [label.kind for label in self._compiled_labels]
         groups = [padded([label.keys for label in self._compiled_labels])]
         for batch in self._batches:
-            kinds += [batch.kind] * len(batch.names)
+            kinds += [batch.kind] * len(batch)
             groups.append(batch.keys)
         begun = self._begun()
         objects = np.concatenate([_lowest_rows(keys) for keys in groups])
@@ -321,6 +321,16 @@ def bias_key(row: int, visit: int) -> int:
     return int(gtsam.symbol("b", row * _STRIDE + visit))
 
 
+def name_of(keys: Sequence[int]) -> str:
+    """What errors and tables call a factor of some keys: its objects and the latest of their keyframes, or cameras."""
+    variables = [Variable.of(key) for key in keys]
+    placed = [v for v in variables if v.kind == "o"]
+    if not placed:
+        return "cameras " + " and ".join(str(v.index) for v in variables)
+    rows = [str(row) for row in sorted({v.row or 0 for v in placed})]
+    return f"object{'s'[: len(rows) - 1]} {' and '.join(rows)} keyframe {max(v.index for v in placed)}"
+
+
 def keyframes_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Keyframe of each of some keys (n,) of cameras and objects, -1 for b_iv."""
     index = keys & _INDEX
@@ -384,25 +394,20 @@ def build(
     _add_cameras(built, cameras, noise, first)
     for row, (shape, measured) in objects.items():
         built.objects[row] = shape.source.name
+        built.measured[row] = tuple(m.keyframe for m in measured)
         _add_object(built, model, row, shape, measured, cameras, place if model.context else None)
     if model.context:
         _add_context(built, model, objects, first, company or {})
     return built
 
 
-def smooth(
-    built: SmootherGraph,
-    model: Model,
-    objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
-    n: int,
-    first: int = 0,
-) -> Smoothed:
+def smooth(built: SmootherGraph, model: Model, n: int, first: int = 0) -> Smoothed:
     """Solve and take the marginals of the keyframes from `first` to n - 1."""
     settings = model.config.smoother
     problem = built.problem()
     solution = optimise(problem, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
     keys = [camera_key(k) for k in range(first, n)]
-    keys += [object_key(row, m.keyframe) for row, (_, measured) in objects.items() for m in measured]
+    keys += [object_key(row, k) for row, measured in built.measured.items() for k in measured]
     covariance_of = covariances(problem.blocks(solution.values), keys)
     del problem
 
@@ -410,9 +415,7 @@ def smooth(
         return solution.values.atPose3(key).matrix(), covariance_of[key]
 
     cameras = [read(camera_key(k)) for k in range(first, n)]
-    poses = {
-        row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured} for row, (_, measured) in objects.items()
-    }
+    poses = {row: {k: read(object_key(row, k)) for k in measured} for row, measured in built.measured.items()}
     T, covariance = (np.stack([camera[i] for camera in cameras]) for i in range(2))
     return Smoothed(solution, T, covariance, poses, built.contributions(solution.values))
 
@@ -443,8 +446,7 @@ def _drifts(drifting: Sequence[int], cameras: Sequence[Camera], noise: Localisat
     fresh = sigmas * np.sqrt(np.maximum(1.0 - rho**2, 1e-6))[:, None]
     recorded = [np.stack([c.T_world_camera for c in those]) for those in (before, after)]
     keys = np.array([(camera_key(k - 1), camera_key(k)) for k in drifting])
-    names = tuple(f"cameras {k - 1} and {k}" for k in drifting)
-    return Batch("localisation", names, keys, Drifts(recorded[0], recorded[1], rho, fresh))
+    return Batch("localisation", keys, Drifts(recorded[0], recorded[1], rho, fresh), name_of)
 
 
 def _add_object(
@@ -462,7 +464,6 @@ def _add_object(
     recorded = np.stack([cameras[m.keyframe].T_world_camera for m in measured])
     T = recorded @ np.stack([m.T_camera_centre for m in measured])
     keys = np.array([object_key(row, m.keyframe) for m in measured])
-    names = tuple(f"object {row} keyframe {m.keyframe}" for m in measured)
     old = int(built.initial.exists(int(keys[0])))  # the first, where it is carried
     if old:
         T[0] = built.initial.atPose3(int(keys[0])).matrix()
@@ -470,10 +471,10 @@ def _add_object(
     T = _one_image(T, S)
     if len(measured) > old:
         new = slice(old, None)
-        _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new], names[new])
+        _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new])
         if place is not None:
-            _add_standing(built, model, shape, place, measured[new], T[new], keys[new], names[new])
-    _add_predictions(built, model, S, measured, keys, names)
+            _add_standing(built, model, shape, place, measured[new], T[new], keys[new])
+    _add_predictions(built, model, S, measured, keys)
 
 
 def _add_measurements(
@@ -485,7 +486,6 @@ def _add_measurements(
     recorded: Array,
     T: Array,
     keys: NDArray[np.int64],
-    names: tuple[str, ...],
 ) -> None:
     for key, pose in zip(keys.tolist(), T, strict=True):
         built.initial.insert(key, gtsam.Pose3(pose))
@@ -496,9 +496,9 @@ def _add_measurements(
     seen_by = [(camera_key(m.keyframe), key, bias_key(row, m.visit)) for m, key in zip(measured, keys, strict=True)]
     information = np.linalg.inv(np.stack([m.covariance for m in measured]))
     modes = Modes(se3.inverse(recorded) @ T, information, S)
-    built.add_batch(Batch("measurement", names, np.array(seen_by), modes))
+    built.add_batch(Batch("measurement", np.array(seen_by), modes, name_of))
     if S.free:
-        built.add_batch(Batch("gauge", names, keys[:, None], Gauges(T, S)))
+        built.add_batch(Batch("gauge", keys[:, None], Gauges(T, S), name_of))
 
 
 def _add_standing(
@@ -509,7 +509,6 @@ def _add_standing(
     measured: Sequence[Measured],
     T: Array,
     keys: NDArray[np.int64],
-    names: tuple[str, ...],
 ) -> None:
     """That it stands flat while it stays: a fact spread over the keyframes between which it can't have tipped."""
     up = place.up_world
@@ -520,9 +519,8 @@ def _add_standing(
         time_s = np.array([measured[i].time_s for i in footing.rows])
         shared = (np.abs(time_s[:, None] - time_s) <= as_one_s).sum(axis=1)
         sigma = np.full(len(shared), tilt)
-        at = tuple(names[i] for i in footing.rows)
         terms = Standings(footing.level, up, sigma, shared)
-        built.add_batch(Batch("standing", at, keys[footing.rows, None], terms))
+        built.add_batch(Batch("standing", keys[footing.rows, None], terms, name_of))
 
 
 def _one_image(T: Array, S: symmetry.Symmetry) -> Array:
@@ -539,7 +537,6 @@ def _add_predictions(
     S: symmetry.Symmetry,
     measured: Sequence[Measured],
     keys: NDArray[np.int64],
-    names: Sequence[str],
 ) -> None:
     stays = [i for i in range(1, len(measured)) if measured[i].stays]
     if not stays:
@@ -550,10 +547,11 @@ def _add_predictions(
         pairs = np.stack([keys[[i - 1, i]] for i in stays])
         start = np.stack([built.initial.atPose3(key).matrix() for key in pairs[:, 0].tolist()])
         terms = Predictions(sigma, S, start if S.free else None)
-        built.add_batch(Batch("prediction", tuple(names[i] for i in stays), pairs, terms))
+        built.add_batch(Batch("prediction", pairs, terms, name_of))
         return
     for i, covariance in zip(stays, sigma, strict=True):
-        built.add("prediction", names[i], stay_factor(int(keys[i - 1]), int(keys[i]), covariance))
+        pair = int(keys[i - 1]), int(keys[i])
+        built.add("prediction", name_of(pair), stay_factor(*pair, covariance))
 
 
 def shared_flatness(covariances: Array, radius_m: float) -> Array:
@@ -614,10 +612,10 @@ def _add_context(
     n = len(pairs)
     of = np.array([(objects[a][0].index, objects[b][0].index) for a, b, _, _ in pairs])
     related = model.relations[of[:, 0], of[:, 1]]
-    terms = Contexts(np.zeros((n, 2, 3)), related, np.zeros(n), np.array([shared for *_, shared in pairs]))
+    centres, nothing = np.broadcast_to(0.0, (n, 2, 3)), np.broadcast_to(0.0, n)
+    terms = Contexts(centres, related, nothing, np.array([shared for *_, shared in pairs]))
     keys = np.array([(object_key(a, k), object_key(b, k)) for a, b, k, _ in pairs])
-    names = tuple(f"objects {a} and {b} keyframe {k}" for a, b, k, _ in pairs)
-    built.add_batch(Batch("context", names, keys, terms))
+    built.add_batch(Batch("context", keys, terms, name_of))
 
 
 def _partner(company: Company, a: int, b: int, classes: tuple[int, int]) -> Partner | None:
@@ -635,5 +633,5 @@ def _add_partners(
     related = model.relations[np.full(n, c_a), np.full(n, c_b)]
     symmetries = model.shapes[c_a].symmetry, model.shapes[c_b].symmetry
     terms = Partners(related, partner.relation, symmetries, np.full(n, float(partner.candidates)), np.full(n, shared))
-    names = tuple(f"objects {pair[0]} and {pair[1]} keyframe {k}" for k in at)
-    built.add_batch(Batch("context", names, np.array([(object_key(a, k), object_key(b, k)) for k in at]), terms))
+    keys = np.array([(object_key(a, k), object_key(b, k)) for k in at])
+    built.add_batch(Batch("context", keys, terms, name_of))

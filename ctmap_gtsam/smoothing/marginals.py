@@ -64,8 +64,10 @@ def covariances(blocks: Blocks, keys: Sequence[int]) -> dict[int, Array]:
         blocks: the linear system.
         keys: of which variables.
     """
-    asked, out = set(keys), {}
-    messages, later = blocks.messages(), None
+    asked = set(keys)
+    out: dict[int, Array] = {}
+    messages = blocks.messages()
+    later: Joint | None = None
     while messages:
         message = messages.pop()
         handed = () if message is None else tuple(message.keys())
@@ -87,9 +89,10 @@ def _of_block(
         handed: keys of the message.
         later: what its neighbours in later blocks are together; None = there are none.
     """
-    tree, out = _tree(blocks, block, message), {}
-    before = None
-    for joint in joints(tree, [key for key in blocks.own[block] if key in asked or key in handed], later):
+    tree = _tree(blocks, block, message)
+    out: dict[int, Array] = {}
+    before: Joint | None = None
+    for joint in joints(tree, [key for key in blocks.own[block].tolist() if key in asked or key in handed], later):
         out.update((key, joint.of([key])) for key in joint.frontals if key in asked)
         # a message is one factor, so one clique has all of its variables
         if handed and before is None and joint.rows.keys() >= set(handed):
@@ -104,7 +107,7 @@ def _tree(blocks: Blocks, block: int, message: Any) -> Any:
     """gtsam.GaussianBayesTree of a block's own variables, given those of later blocks."""
     linear = blocks.graph(block, message)
     if block < len(blocks.own) - 1:
-        return linear.eliminatePartialMultifrontal(list(blocks.own[block]))[0]
+        return linear.eliminatePartialMultifrontal(blocks.own[block].tolist())[0]
     return linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
 
 

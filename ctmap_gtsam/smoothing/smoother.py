@@ -7,7 +7,7 @@ trellis; solve one graph of all poses; and the smoothed map is what the next rou
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,11 +23,10 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.runtime.checkpoint import Checkpoint
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.sources import code
-from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage
-from ctmap_gtsam.smoothing.graph import Contributions, Measured, Smoothed, SmootherGraph, build, smooth
+from ctmap_gtsam.smoothing.graph import Contributions, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
 from ctmap_gtsam.smoothing.rounds import (
@@ -48,7 +47,6 @@ from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
-Objects = Mapping[int, tuple[Shape, Sequence[Measured]]]
 Look = Callable[[SmootherGraph, Smoothed], object]
 """Who looks at the last round's graph and its solution"""
 
@@ -170,8 +168,8 @@ def smooth_run(
         del found
     current = state.current
     if look is not None:
-        built, objects = _graph(recording, model, current.things, current.company)
-        look(built, smooth(built, model, objects, len(recording.keyframes)))
+        built = _graph(recording, model, current.things, current.company)
+        look(built, smooth(built, model, len(recording.keyframes)))
     estimate = write(recording, model, current.things, current.smoothed, _diagnostics(proposer, state))
     if checkpoint is not None:
         checkpoint.remove()
@@ -258,8 +256,8 @@ def _solve(recording: Recording, model: Model, found: Found) -> Map:
     boxes, sightings, company = found.boxes, found.sightings, found.company
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, recording, model), recording, model)
-    built, objects = _graph(recording, model, things, company)
-    smoothed = smooth(built, model, objects, len(recording.keyframes))
+    built = _graph(recording, model, things, company)
+    smoothed = smooth(built, model, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
     # the arrays are all that anybody needs from here on, and GTSAM's values can't be kept
     smoothed = replace(smoothed, solution=replace(smoothed.solution, values=None))
@@ -268,11 +266,11 @@ def _solve(recording: Recording, model: Model, found: Found) -> Map:
 
 def _graph(
     recording: Recording, model: Model, things: Mapping[int, Thing], company: Mapping[int, Company]
-) -> tuple[SmootherGraph, Objects]:
-    """The graph of all that is, and what each object was taken for."""
+) -> SmootherGraph:
+    """The graph of all that is."""
     cameras = [camera_of(recording, k) for k in range(len(recording.keyframes))]
     objects = objects_of(things, recording, model)
-    return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place), objects
+    return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place)
 
 
 def _settled(a: Mapping[int, Outline], b: Mapping[int, Outline], model: Model) -> bool:
