@@ -23,7 +23,7 @@ from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from ctmap_gtsam.smoothing.batched import Batch, Problem, padded
+from ctmap_gtsam.smoothing.batched import BLOCK, Batch, Problem, padded
 from ctmap_gtsam.smoothing.footing import footings
 from ctmap_gtsam.smoothing.marginals import covariances
 from ctmap_gtsam.smoothing.solver import Solution, optimise
@@ -148,9 +148,9 @@ class SmootherGraph:
             Label(batch.kind, batch.name(keys), tuple(keys)) for batch in self._batches for keys in batch.keys.tolist()
         ]
 
-    def problem(self) -> Problem:
-        """The same as the solver takes it."""
-        return Problem(self._compiled, self._batches, self.initial, keyframes_of)
+    def problem(self, block: int = BLOCK) -> Problem:
+        """The same as the solver takes it, which eliminates so many keyframes together, or more."""
+        return Problem(self._compiled, self._batches, self.initial, keyframes_of, block)
 
     def to_gtsam(self) -> Any:
         """The same as a gtsam.NonlinearFactorGraph, with a CustomFactor for each that GTSAM has none for."""
