@@ -81,7 +81,7 @@ class View:
         return replace(self, tile=coarser(self.tile, COARSE), samples=self.samples * COARSE**2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # a map holds one for each object, class and keyframe
 class PoseModes:
     """Maxima of the measurement potential for one class in one view, best first: n of them."""
 

@@ -66,9 +66,9 @@ class Map:
     company: Mapping[int, Company]
     """visit -> who was moved together before it, by the round before"""
 
-    def to_start_from(self) -> Map:
-        """The same without what the next round doesn't ask for."""
-        return replace(self, things={i: thing.to_start_from() for i, thing in self.things.items()})
+    def to_start_from(self) -> dict[int, Thing]:
+        """What the next round asks for."""
+        return {i: thing.to_start_from() for i, thing in self.things.items()}
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,9 @@ class Outline:
     """(4, 4)"""
 
 
-def outlines(current: Map) -> dict[int, Outline]:
+def outlines(things: Mapping[int, Thing]) -> dict[int, Outline]:
     """Of all objects of a map."""
-    return {i: Outline(thing.best_class, thing.exists, thing.anchor) for i, thing in current.things.items()}
+    return {i: Outline(thing.best_class, thing.exists, thing.anchor) for i, thing in things.items()}
 
 
 _KEPT = (
@@ -160,10 +160,11 @@ def smooth_run(
     proposer.hypotheses_scored = state.hypotheses_scored
     while not _enough(state, config):
         # of all that was kept of a long run, nothing is held any longer than the next step asks for it
-        state = replace(state, current=state.current.to_start_from())
-        found = _next_look(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
-        before, energies = outlines(state.current), state.energies
+        things, energies = state.current.to_start_from(), state.energies
         del state
+        found = _next_look(recording, proposer, things, told, f"round {len(energies) + 1}")
+        before = outlines(things)
+        del things
         state = _stepped(_solve(recording, model, found), before, energies, proposer, checkpoint)
         del found
     current = state.current
@@ -184,7 +185,7 @@ def _stepped(
     checkpoint: Checkpoint | None,
 ) -> Rounds:
     """The state after a round, which is kept; None = before it there was no map."""
-    settled = before is not None and _settled(before, outlines(following), proposer.model)
+    settled = before is not None and _settled(before, outlines(following.things), proposer.model)
     state = Rounds(following, [*energies, dict(following.energy)], proposer.hypotheses_scored, settled)
     if checkpoint is not None:
         checkpoint.save(state)
@@ -231,23 +232,25 @@ def _first_look(recording: Recording, proposer: Proposer, seeds: Mapping[int, Se
     return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, "round 1"), {})
 
 
-def _next_look(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Found:
+def _next_look(
+    recording: Recording, proposer: Proposer, things: Mapping[int, Thing], progress: Progress, name: str
+) -> Found:
     """Start from the smoothed map; every object's background is the map of the others."""
     model = proposer.model
     visits = visits_of(recording)
-    company = company_of(current.things, visits, recording.place.up_world, model)
+    company = company_of(things, visits, recording.place.up_world, model)
 
     def expected(i: int, k: int) -> Expected | None:
-        return expected_of(current.things[i], k)
+        return expected_of(things[i], k)
 
     def wanted(i: int, k: int) -> Wanted | None:
-        thing = current.things[i]
+        thing = things[i]
         return wanted_of(thing, k, model, lambda c: thing.modes_at(c, k))
 
     def around(k: int) -> Surroundings:
-        return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces, company[visits[k]])
+        return Surroundings(neighbours_of(things, k, model), recording.place.surfaces, company[visits[k]])
 
-    boxes = associate(recording, model, current.things, expected)
+    boxes = associate(recording, model, things, expected)
     return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, name), company)
 
 

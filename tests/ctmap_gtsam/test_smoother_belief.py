@@ -1,5 +1,7 @@
 """What a smoothed object says between its views, and what of it a round needs to start from."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -25,7 +27,7 @@ def numbers(owner):
     """Bytes of all that is held of the views."""
     arrays = [a for stages in owner.stages.values() for s in stages for a in (s.T_world_centre, s.covariance)]
     modes = [m for s in owner.sightings.values() for m in s.modes if m is not None]
-    return sum(a.nbytes for a in arrays) + sum(a.nbytes for m in modes for a in vars(m).values())
+    return sum(a.nbytes for a in arrays) + sum(getattr(m, f.name).nbytes for m in modes for f in fields(m))
 
 
 @given(st.sets(st.integers(0, 7), min_size=1), st.integers(-2, 10))
