@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctmap_gtsam.bench.solver import make_task
