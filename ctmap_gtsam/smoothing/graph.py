@@ -517,7 +517,8 @@ def _add_standing(
     for footing in footings(T, [m.stays for m in measured], shape, place, model):
         assert up is not None
         time_s = np.array([measured[i].time_s for i in footing.rows])
-        shared = (np.abs(time_s[:, None] - time_s) <= as_one_s).sum(axis=1)
+        # row by row: all pairs at once are the square of a long run
+        shared = np.array([np.count_nonzero(np.abs(time_s - t) <= as_one_s) for t in time_s])
         sigma = np.full(len(shared), tilt)
         terms = Standings(footing.level, up, sigma, shared)
         built.add_batch(Batch("standing", keys[footing.rows, None], terms, name_of))
