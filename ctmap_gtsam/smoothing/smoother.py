@@ -155,6 +155,7 @@ def smooth_run(
     state: Rounds | None = None if checkpoint is None else checkpoint.load()
     if state is None:
         found = _first_look(recording, proposer, seeds(forward, model), told)
+        del forward  # of a long run it is as much as what was found in the images
         state = _stepped(_solve(recording, model, found), None, [], proposer, checkpoint)
         del found
     proposer.hypotheses_scored = state.hypotheses_scored
