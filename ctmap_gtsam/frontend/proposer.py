@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ _BOX_SLACK = 0.15  # of a box's sides by which the thing may reach beyond it on 
 _ONE_WAY_ROUND_RAD = 0.4  # how far a turn from one near-symmetry to the next may be off
 _CLOSER, _CLOSER_SHARE = 3, 0.25  # times as many starts as modes are kept, and share of all, that are looked at closely
 _MOSTLY_SEEN = 0.85  # of what is measured of a silhouette: less of it, and it may stand another way about what shows
+_LEVEL = 3.0  # nats: ways round that a view hardly tells apart
 _ONE_POSE = (0.12, 0.008)  # rad, metres: what lies nearer to each other in one view is one mode
 
 
@@ -250,8 +252,8 @@ class Proposer:
             probe: whether to climb along the axes on the score, and to take covariances from its shape (else from the
                 registration's normal equations).
             ways_round: whether the best is tried as turned by each of the class's near-symmetries and about what
-                shows of it, too, and the best of each is kept: all views decide which way round it stands, not which
-                ways were tried.
+                shows of it, too, and the best of each is kept, and ways that fit all but equally well have as many
+                modes each: all views decide which way round it stands, not which ways were tried.
         """
         if len(starts) == 0:
             return _no_modes()
@@ -260,13 +262,13 @@ class Proposer:
         starts = np.concatenate([starts, ways])
         candidates = np.concatenate([self._refine(shape, view, starts, self._fine), starts])
         score, scores = self.score(shape, view, candidates)
-        keep = self._distinct(shape, candidates, score, ways)
+        keep = self._distinct(shape, candidates, score, ways, ways_round)
         known: dict[int, Array] = {}
         if probe and view.detection is not None:
             climbed, known = self._climb(shape, view, candidates[keep])
             candidates = np.concatenate([climbed, candidates[keep]])
             score, scores = self.score(shape, view, candidates)
-            keep = self._distinct(shape, candidates, score, ways)
+            keep = self._distinct(shape, candidates, score, ways, ways_round)
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe, [known.get(row) for row in keep])
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
@@ -426,10 +428,10 @@ class Proposer:
         turned = T[:, None] @ there[:, None] @ se3.make(_HALF_TURNS[1:], np.zeros(3)) @ se3.inverse(there)[:, None]
         return turned.reshape(-1, 4, 4)
 
-    def _distinct(self, shape: Shape, poses: Array, score: Array, ways: Array) -> list[int]:
-        """Rows of the best few poses (n, 4, 4), and beside those of the best that is turned as each of (t, 4, 4)."""
+    def _distinct(self, shape: Shape, poses: Array, score: Array, ways: Array, turns: bool) -> list[int]:
+        """Rows of the best few poses (n, 4, 4), in turn or not, and those of the best turned as each of (t, 4, 4)."""
         rows = distinct(shape, poses, score, _ONE_POSE, len(poses))
-        kept = rows[: self.settings.max_modes]
+        kept = (in_turn(shape, poses, score, rows) if turns else rows)[: self.settings.max_modes]
         for way in ways:
             there = symmetry.near(way, poses[rows], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
             if there.any() and rows[int(np.argmax(there))] not in kept:
@@ -519,6 +521,29 @@ class Proposer:
         scaled = hessian * unit[:, None] * unit * self.model.kappa / sensor.sigma_m**2
         scaled = scaled + np.eye(6) / _LADDER_M[-1] ** 2
         return np.linalg.inv(scaled) * unit[:, None] * unit
+
+
+def in_turn(shape: Shape, poses: Array, score: Array, rows: list[int]) -> list[int]:
+    """Rows reordered so that ways round that fit all but equally well take turns.
+
+    Of two that a view can't tell apart, the one with more modes would have the ridges that depth leaves flat covered
+    better, view by view, which says nothing of which it is.
+
+    Args:
+        shape: the class.
+        poses: (n, 4, 4).
+        score: (n,) nats.
+        rows: of poses, the best first.
+    """
+    ways: list[list[int]] = []
+    left = rows
+    while left:
+        alike = symmetry.near(poses[left[0]], poses[left], shape.symmetry, _ONE_WAY_ROUND_RAD, np.inf)
+        ways.append([row for row, same in zip(left, alike, strict=True) if same])
+        left = [row for row, same in zip(left, alike, strict=True) if not same]
+    level = [way for way in ways if score[way[0]] > score[rows[0]] - _LEVEL]
+    first = [row for turn in zip_longest(*level) for row in turn if row is not None]
+    return first + [row for row in rows if row not in first]
 
 
 def distinct(shape: Shape, poses: Array, score: Array, apart: tuple[float, float], most: int) -> list[int]:

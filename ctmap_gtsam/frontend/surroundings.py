@@ -36,7 +36,7 @@ class Neighbour:
     T_world_centre: Array
     """(4, 4)"""
     log_evidence: float
-    """of its being there, nats"""
+    """of its being there, nats, or what else says whose the place is: comparable among neighbours alone"""
 
     def yields_to(self, other: Neighbour) -> bool:
         """Whether both claim the same space and the other has more evidence: the pixels there are the other's alone."""

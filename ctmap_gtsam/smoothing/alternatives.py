@@ -18,6 +18,7 @@ from scipy.stats import chi2, norm
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import NEARLY, Shape
 from ctmap_gtsam.smoothing.belief import Thing
+from ctmap_gtsam.smoothing.discrete import Stage
 from ctmap_gtsam.smoothing.modes import Recording
 from factors.symmetry import residual
 from sequences import se3
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 
 _SAME = 0.99  # of the scatter of one pose's views: a mode within it is no other pose
 _ONE_WAY_RAD = 0.5  # a mode within this of a way round is the thing, turned so
+_FOUND = 3  # ways round that no near-symmetry explains, at most
 _LESS = 0.98  # of the reported pose's share: what another way round, or an exchanged thing's place, has at most
 
 
@@ -52,10 +54,20 @@ class Mode:
         return d <= float(chi2.ppf(_SAME, len(r)))
 
 
+@dataclass(frozen=True)
+class Ways:
+    """Other ways round that a thing may stand, in the frame of the reported pose."""
+
+    T_own_way: Array
+    """(n, 4, 4)"""
+    lead: Array
+    """(n,) by how many nats a view the reported pose is ahead; inf where no view tells"""
+
+
 def ways_round(
-    own: Mode, others: Sequence[Mode], shape: Shape, lead: Array, sigma: float
+    own: Mode, others: Sequence[Mode], shape: Shape, ways: Ways, sigma: float
 ) -> tuple[Mode, tuple[Mode, ...]]:
-    """The belief where depth's word between near-symmetric ways round has an end.
+    """The belief where depth's word between ways round has an end.
 
     The error of a thing's own surface, which is the same in each view, favours a way by some nats a view, with standard
     deviation `sigma`: more views are no more certain than the mean of them, and another way is the true one with
@@ -66,25 +78,23 @@ def ways_round(
         others: further modes of the same view, those that are all but impossible included: they are where a turned
             thing fits best.
         shape: the class.
-        lead: (n,) by how many nats a view the reported way is ahead of each turned by a near-symmetry, see
-            `leads`; inf where no view was tried.
+        ways: see `other_ways`.
         sigma: as above.
 
     Returns:
         Both with new shares, and a mode for each way that had none.
     """
-    if not len(lead):
+    if not len(ways.lead):
         return own, tuple(others)
-    turns = se3.make(shape.near_symmetries, np.zeros(3))
-    members: list[list[Mode]] = [[] for _ in lead]
+    members: list[list[Mode]] = [[] for _ in ways.lead]
     rest: list[Mode] = []
     for mode in others:
-        way = _way(own.T_world_centre @ turns, mode.T_world_centre[None], shape)[0]
+        way = _way(own.T_world_centre @ ways.T_own_way, mode.T_world_centre[None], shape)[0]
         (rest if way < 0 else members[way]).append(mode)
-    wrong = norm.cdf(-lead / sigma)
+    wrong = norm.cdf(-ways.lead / sigma)
     odds = np.minimum(wrong / np.maximum(1.0 - wrong, wrong), _LESS)
     out = rest
-    for turn, way, ratio in zip(turns, members, odds.tolist(), strict=True):
+    for turn, way, ratio in zip(ways.T_own_way, members, odds.tolist(), strict=True):
         # the view's best pose of that way takes what is missing; where the view has none, the reported pose turned
         best = max(way, key=lambda m: m.share, default=_turned(own, turn, shape))
         missing = max(ratio * own.share - sum(m.share for m in way), 0.0)
@@ -93,8 +103,11 @@ def ways_round(
     return own.times(1.0 / total), tuple(mode.times(1.0 / total) for mode in out)
 
 
-def leads(thing: Thing, visit: int, own: Array, recording: Recording, model: Model) -> Array:
-    """By how many nats a view of a visit the pose is ahead of each way round that looks nearly the same.
+def other_ways(thing: Thing, visit: int, own: Array, recording: Recording, model: Model) -> Ways:
+    """The ways round that look nearly the same, and those that views of a visit took for the pose, and their leads.
+
+    Of a near-symmetry the views count that have a mode of both. Any other way is one that happened to fit some views,
+    such as that of a thing half hidden: where a view hasn't kept it, it is as good as the worst that it has, at most.
 
     Args:
         thing: the object.
@@ -102,35 +115,50 @@ def leads(thing: Thing, visit: int, own: Array, recording: Recording, model: Mod
         own: (4, 4) its pose in the world.
         recording: the run.
         model: potentials.
-
-    Returns:
-        (n,) for each of the reported class's near-symmetries; inf where no view has a mode of both.
     """
     c = thing.reported_class
     shape = model.shapes[c]
-    if not len(shape.near_symmetries):
-        return np.zeros(0)
-    ways = own @ se3.make(np.concatenate([np.eye(3)[None], shape.near_symmetries]), np.zeros(3))
-    told = []
-    for stage in thing.stages[c]:
-        if recording.run.frames[int(recording.keyframes[stage.keyframe])].visit == visit and len(stage.log_evidence):
-            which = _way(ways, stage.T_world_centre, shape)
-            nats = [stage.log_evidence[which == w].max(initial=-np.inf) for w in range(len(ways))]
-            told.append(nats[0] - np.array(nats[1:]) if np.isfinite(nats[0]) else np.full(len(ways) - 1, np.inf))
-    views = np.array(told).reshape(-1, len(ways) - 1)
-    known = np.isfinite(views)
-    mean = np.where(known, views, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(known.any(axis=0), mean, np.inf)
+    stages = [
+        stage
+        for stage in thing.stages[c]
+        if recording.run.frames[int(recording.keyframes[stage.keyframe])].visit == visit and len(stage.log_evidence)
+    ]
+    near = se3.make(np.concatenate([np.eye(3)[None], shape.near_symmetries]), np.zeros(3))
+    turns = _with_found(near, own, stages, shape)
+    lead = np.full((len(stages), len(turns) - 1), np.inf)
+    for row, stage in zip(lead, stages, strict=True):
+        which, nats = _way(own @ turns, stage.T_world_centre, shape), stage.log_evidence
+        best = np.array([nats[which == w].max(initial=-np.inf) for w in range(len(turns))])
+        if np.isfinite(best[0]):
+            at_most = nats.min() if len(nats) >= model.config.frontend.max_modes else 0.0
+            best[len(near) :] = np.maximum(best[len(near) :], at_most)
+            row[:] = best[0] - best[1:]
+    known = np.isfinite(lead)
+    mean = np.where(known, lead, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return Ways(turns[1:], np.where(known.any(axis=0), mean, np.inf))
+
+
+def _with_found(turns: Array, own: Array, stages: Sequence[Stage], shape: Shape) -> Array:
+    """(n, 4, 4) T_own_way of known ways, and of those that modes of views are turned in besides, the best first."""
+    if not stages:
+        return turns
+    poses = np.concatenate([stage.T_world_centre for stage in stages])
+    nats = np.concatenate([stage.log_evidence for stage in stages])
+    turned = np.linalg.norm(residual(own, poses, shape.symmetry)[:, :3], axis=-1) > _ONE_WAY_RAD
+    left = poses[turned][np.argsort(-nats[turned], kind="stable")]
+    for _ in range(_FOUND):
+        left = left[_way(own @ turns, left, shape) < 0] if len(left) else left
+        if not len(left):
+            break
+        turns = np.concatenate([turns, se3.inverse(own) @ left[:1]])
+    return turns
 
 
 def _way(ways: Array, T: Array, shape: Shape) -> NDArray[np.int64]:
     """(m,) which of the poses (n, 4, 4) each of the poses (m, 4, 4) is nearly turned as; -1 for none."""
     r = residual(np.broadcast_to(ways[:, None], (len(ways), *T.shape)), T[None], shape.symmetry)
-    apart = np.linalg.norm(r[..., :3], axis=-1)
-    near = np.argmin(apart, axis=0)
-    at = near, np.arange(len(T))
-    fits = (apart[at] < _ONE_WAY_RAD) & (np.linalg.norm(r[..., 3:], axis=-1)[at] < shape.radius_m)
-    return np.where(fits, near, -1)
+    apart = np.where(np.linalg.norm(r[..., 3:], axis=-1) < shape.radius_m, np.linalg.norm(r[..., :3], axis=-1), np.inf)
+    return np.where(apart.min(axis=0) < _ONE_WAY_RAD, np.argmin(apart, axis=0), -1)
 
 
 def _turned(own: Mode, turn: Array, shape: Shape) -> Mode:

@@ -59,6 +59,8 @@ class Thing:
     """(C,) the scores' part of it"""
     posterior: tuple[float, Array]
     """P(a known mesh rather than clutter or nothing) and the classes' probabilities (C,), see `Model.existence`"""
+    claims: Array
+    """(views,) what all views of a visit say for the best class where it then stood, nats: other visits' don't count"""
     poses: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
     """keyframe -> smoothed T_world_centre (4, 4) and covariance (6, 6) of the best class"""
 
@@ -158,6 +160,11 @@ class Thing:
         i = max(int(np.searchsorted(self.keyframes, keyframe, side="right")) - 1, 0)
         return float(self.presence[i])
 
+    def claim_at(self, keyframe: int) -> float:
+        """By which of two things in one place has it at a keyframe: what it explains there in that visit, nats."""
+        i = self._measured_near(self.best_class, keyframe)
+        return 0.0 if i is None else float(self.claims[i])
+
     def present_pose(self, keyframe: int) -> Array | None:
         """(4, 4) where it surely is at a keyframe; None where that isn't sure, or its class isn't."""
         sure = self.exists and self.class_probability[self.best_class] > SURE and self.presence_at(keyframe) > 0.5
@@ -224,6 +231,14 @@ class Thing:
             return np.zeros((0, 4, 4))
         return self.stages[c][i].T_world_centre
 
+    def modes_beside(self, c: int, keyframe: int) -> Array:
+        """(n, 4, 4) T_world_centre of the modes of class c in the views before and after a keyframe that is one."""
+        i = self.view_at(keyframe)
+        if c not in self.stages or i == len(self.keyframes) or self.keyframes[i] != keyframe:
+            return np.zeros((0, 4, 4))
+        beside = self.stages[c][max(i - 1, 0) : i] + self.stages[c][i + 1 : i + 2]
+        return np.concatenate([np.zeros((0, 4, 4)), *(stage.T_world_centre for stage in beside)])
+
     def to_start_from(self) -> Thing:
         """The same without what only its graph and the estimate ask for: sightings' modes, and covariances.
 
@@ -279,7 +294,20 @@ def judge(
     solid, probability = model.existence(log_evidence, posed, clutter, witness, 0.0)
     # objects are what was detected: what has no box of its own left is what others are
     posterior = (solid if boxes else 0.0, probability)
-    return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior)
+    visits = [recording.run.frames[int(recording.keyframes[k])].visit for k in keyframes]
+    claims = _claims(stages[best], posteriors[best], visits) if best in stages else np.zeros(len(keyframes))
+    return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior, claims)
+
+
+def _claims(stages: tuple[Stage, ...], posterior: Posterior, visits: Sequence[int]) -> Array:
+    """(views,) what the views say along the best path, summed for as long as a visit lasts and the thing stays."""
+    said = [
+        float(stage.log_evidence[state]) if state < len(stage.log_evidence) else 0.0
+        for stage, state in zip(stages, posterior.path, strict=True)
+    ]
+    begins = [i == 0 or visits[i] != visits[i - 1] or not posterior.stayed(i) for i in range(len(stages))]
+    stand = np.cumsum(begins) - 1
+    return np.asarray(np.bincount(stand, weights=said)[stand])
 
 
 def _witness(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping[int, Sighting], c: int) -> float:

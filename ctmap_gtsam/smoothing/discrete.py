@@ -2,13 +2,13 @@
 
 States at a keyframe are the view's modes, "unmeasured" (it is where it was, and none of the modes is its pose) and
 "gone" (not here at all: not yet, no longer, or elsewhere). A mode's evidence is its likelihood times the volume under
-it, which is the integral of exp(log f - 1/2 r^T L r) over poses; transitions integrate the prediction over the mode's
-Gaussian and over what its most probable past knows (a switching Kalman filter that keeps one component a state;
-Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single views would charge a long track for every view
-anew. Unmeasured explains a view as well as a pose could that has nothing to do with the thing, at a price: a view that
-is misread, or a silhouette that something unknown hides, is no move. The normaliser is the class evidence, against
-nothing being there; one pass gives which mode, when present, and whether it moved. Log space throughout (Rabiner,
-Proc. IEEE 1989).
+it, which is the integral of exp(log f - 1/2 r^T L r) over poses, shared where modes lie on one hump; transitions
+integrate the prediction over the mode's Gaussian and over what its most probable past knows (a switching Kalman filter
+that keeps one component a state; Bar-Shalom, Li and Kirubarajan 2001, ch. 11): integrating over single views would
+charge a long track for every view anew. Unmeasured explains a view as well as a pose could that has nothing to do with
+the thing, at a price: a view that is misread, or a silhouette that something unknown hides, is no move. The normaliser
+is the class evidence, against nothing being there; one pass gives which mode, when present, and whether it moved. Log
+space throughout (Rabiner, Proc. IEEE 1989).
 """
 
 from __future__ import annotations
@@ -114,16 +114,28 @@ class _Step:
 
 
 def _emission(stage: Stage, model: Model, shape: Shape) -> Array:
-    """(n + 2,): a mode's integral over poses; gone is what everything is compared with, 0."""
+    """(n + 2,): a mode's part of the integral over poses; gone is what everything is compared with, 0."""
     if not len(stage.log_evidence):
         return np.zeros(2)  # nothing was measured, nothing is misread
     reduced = shape.symmetry.reduced_covariance(stage.covariance)
     volume = 0.5 * (np.linalg.slogdet(reduced)[1] + reduced.shape[-1] * LOG_2PI)
-    modes = stage.log_evidence + volume
+    modes = stage.log_evidence + _log_own_share(stage, shape, reduced) + volume
     anyhow = max(float(log_sum(modes)) + model.log_uniform(shape), 0.0)
     p = model.config.smoother.unmeasured
     with np.errstate(divide="ignore"):
         return np.concatenate([modes + np.log1p(-p), [np.log(p) + anyhow, 0.0]])
+
+
+def _log_own_share(stage: Stage, shape: Shape, reduced: Array) -> Array:
+    """(n,) of the likelihood where a mode has its peak, its share in the sum of all modes' Gaussians there.
+
+    Of several modes on one hump, such as a ridge that depth leaves flat, each would count the whole hump, and so would
+    each view: the way round with more modes a hump would win.
+    """
+    apart = symmetry.residual(stage.T_world_centre[:, None], stage.T_world_centre[None], shape.symmetry)
+    apart = apart @ shape.symmetry.projection.T
+    squared = (apart * np.linalg.solve(reduced[:, None], apart[..., None])[..., 0]).sum(axis=-1)
+    return stage.log_evidence - np.asarray(log_sum(stage.log_evidence[:, None] - 0.5 * squared, axis=0))
 
 
 @dataclass(frozen=True)

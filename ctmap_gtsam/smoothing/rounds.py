@@ -15,8 +15,12 @@ from ctmap_gtsam.smoothing.association import Expected
 from ctmap_gtsam.smoothing.belief import Thing
 from ctmap_gtsam.smoothing.graph import Camera, Measured
 from ctmap_gtsam.smoothing.modes import Recording, Wanted
+from factors import symmetry
 
 Array = NDArray[np.float64]
+
+_ONE_WAY = (0.5, 0.1)  # rad, metres: what lies nearer to a start is not another way round
+_MOST_FRESH = 2  # starts from the views beside, of a class
 
 
 def expected_of(thing: Thing, keyframe: int) -> Expected | None:
@@ -42,6 +46,10 @@ def wanted_of(thing: Thing, keyframe: int, model: Model, known: Callable[[int], 
         # what a keyframe has settled on may be wrong: the middle of its life has another say
         near = [thing.pose_near(c, keyframe), thing.anchor[None] if c == best and thing.anchor is not None else None]
         starts[c] = np.concatenate([*(n for n in near if n is not None), known(c)])
+        # nor may a view have missed the way round that those next to it take it for
+        beside = thing.modes_beside(c, keyframe)
+        fresh = [T for T in beside if not symmetry.near(T, starts[c], model.shapes[c].symmetry, *_ONE_WAY).any()]
+        starts[c] = np.concatenate([starts[c], *(T[None] for T in fresh[:_MOST_FRESH])])
     pose = thing.pose_near(best, keyframe)
     return None if pose is None else Wanted(starts, (best, pose[0]), frozenset(thing.likely()))
 
@@ -50,7 +58,7 @@ def neighbours_of(things: Mapping[int, Thing], keyframe: int, model: Model) -> t
     """The objects that are surely there at a keyframe."""
     there = ((thing, thing.present_pose(keyframe)) for thing in things.values())
     return tuple(
-        Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.log_evidence)
+        Neighbour(thing.object_id, model.shapes[thing.best_class], pose, thing.claim_at(keyframe))
         for thing, pose in there
         if pose is not None
     )

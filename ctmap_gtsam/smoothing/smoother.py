@@ -7,6 +7,7 @@ trellis; solve one graph of all poses; and the smoothed map is what the next rou
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -225,9 +226,12 @@ def _first_look(recording: Recording, proposer: Proposer, seeds: Mapping[int, Se
 
     boxes = associate(recording, model, seeds, expected)
 
+    visits = visits_of(recording)
+    seen = {j: Counter(visits[k] for k in own) for j, own in boxes.items()}
+
     def around(k: int) -> Surroundings:
-        # of two things in one place, the one with more boxes has it
-        there = (seed.neighbour(k, float(len(boxes[j])), model) for j, seed in seeds.items())
+        # of two things in one place, the one with more boxes in this visit has it
+        there = (seed.neighbour(k, float(seen[j][visits[k]]), model) for j, seed in seeds.items())
         return Surroundings(tuple(n for n in there if n is not None), recording.place.surfaces)
 
     return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, "round 1"), {})

@@ -16,7 +16,7 @@ from ctmap_gtsam.frontend.standing import with_supports
 from ctmap_gtsam.frontend.visibility import outlook
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from ctmap_gtsam.smoothing.alternatives import Exchanges, Mode, elsewhere, exchanges, leads, ways_round
+from ctmap_gtsam.smoothing.alternatives import Exchanges, Mode, Ways, elsewhere, exchanges, other_ways, ways_round
 from ctmap_gtsam.smoothing.belief import Held, Thing
 from ctmap_gtsam.smoothing.discrete import Stage
 from ctmap_gtsam.smoothing.graph import Contributions, Smoothed
@@ -64,14 +64,14 @@ class Told:
     model: Model
     things: Mapping[int, Thing]
     exchanges: Exchanges
-    _leads: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False, compare=False)
+    _ways: dict[tuple[int, int], Ways] = field(default_factory=dict, repr=False, compare=False)
 
-    def leads(self, thing: Thing, visit: int, own: Array) -> Array:
-        """`alternatives.leads` of an object in a visit, worked out once, with the first of its poses that is asked."""
+    def other_ways(self, thing: Thing, visit: int, own: Array) -> Ways:
+        """Those of an object in a visit (`alternatives`), worked out once, with the first pose that is asked."""
         key = thing.object_id, visit
-        if key not in self._leads:
-            self._leads[key] = leads(thing, visit, own, self.recording, self.model)
-        return self._leads[key]
+        if key not in self._ways:
+            self._ways[key] = other_ways(thing, visit, own, self.recording, self.model)
+        return self._ways[key]
 
 
 def write_at(tables: Tables, row: int, k: int, thing: Thing, told: Told, T_world_camera: Array) -> None:
@@ -127,8 +127,8 @@ def _belief(thing: Thing, k: int, held: Held, own: Mode, told: Told) -> Iterator
     others = [mode for mode in seen if not own.says_the_same(mode, model.shapes[c])]
     own = replace(own, share=max(1.0 - sum(mode.share for mode in others), _LEAST))
     visit = recording.run.frames[int(recording.keyframes[thing.keyframes[held.view]])].visit
-    lead = told.leads(thing, visit, own.T_world_centre)
-    own, turned = ways_round(own, others, model.shapes[c], lead, model.config.smoother.surface_nats)
+    ways = told.other_ways(thing, visit, own.T_world_centre)
+    own, turned = ways_round(own, others, model.shapes[c], ways, model.config.smoother.surface_nats)
     visit = recording.run.frames[int(recording.keyframes[k])].visit
     shares = told.exchanges.at(thing.object_id, visit)
     there = ((i, told.things[i]) for i in shares if told.things[i].presence_at(k) > 0.5)

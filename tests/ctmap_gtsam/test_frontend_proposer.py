@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ctmap_gtsam.frontend.proposer import Proposer
+from ctmap_gtsam.frontend.proposer import Proposer, in_turn
 from ctmap_gtsam.frontend.scoring import refine_on_depth
 from ctmap_gtsam.frontend.surroundings import Surroundings
 from ctmap_gtsam.model import Model
@@ -374,3 +376,24 @@ def test_effort_is_what_the_settings_say():
         counts.append(proposer.hypotheses_scored)
     assert 50 <= counts[0] <= 100
     assert counts[1] < counts[0]
+
+
+@given(st.lists(st.tuples(st.sampled_from([0.0, 1.5, 3.0]), st.floats(0.0, 8.0)), min_size=1, max_size=9))
+def test_ways_round_that_a_view_hardly_tells_apart_take_turns(found):
+    """Each has as many modes as the others, or all of its own; what is behind them comes after, by its score."""
+    shape = shape_named(MODEL, "mug")
+    poses = se3.exp(np.array([[turn, 0.0, 0.0, 0.0, 0.0, 1.0 + 0.1 * n] for n, (turn, _) in enumerate(found)]))
+    score = -np.array([behind for _, behind in found])
+    rows = [int(row) for row in np.argsort(-score, kind="stable")]
+    order = in_turn(shape, poses, score, rows)
+    assert sorted(order) == sorted(rows)
+    assert order[0] == rows[0]
+    turns = np.array([turn for turn, _ in found])
+    level = [t for t in set(turns) if score[turns == t].max() > score.max() - 3.0]
+    for n in range(1, len(order)):
+        had = [int((turns[order[:n]] == t).sum()) for t in level]
+        whole = [int((turns == t).sum()) for t in level]
+        assert all(a >= min(max(had), b) - 1 for a, b in zip(had, whole, strict=True))
+    rest = [row for row in order if turns[row] not in level]
+    assert order[len(order) - len(rest) :] == rest
+    assert (np.diff(score[rest]) <= 0.0).all()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from ctmap_gtsam.model import Model
-from ctmap_gtsam.smoothing.alternatives import Mode, elsewhere, exchanges, leads, ways_round
+from ctmap_gtsam.smoothing.alternatives import Mode, Ways, elsewhere, exchanges, other_ways, ways_round
 from sequences import se3
 from tests.ctmap_gtsam.scenes import model_of, shape_named
 from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, stays, thing
@@ -25,6 +25,10 @@ def mode(share, T=POSE):
     return Mode(share, T, COVARIANCE)
 
 
+def turned_by(lead):
+    return Ways(TURN[None], np.array([lead]))
+
+
 def total(own, others):
     return own.share + sum(m.share for m in others)
 
@@ -37,7 +41,7 @@ def test_what_depth_says_of_two_ways_round_goes_no_further_than_it_can_be_truste
     """The odds of the other way are those of all views together, or those of their mean against the surface's error."""
     shares = np.array([1.0, turned, apart]) / (1.0 + turned + apart)
     others = (mode(shares[1], POSE @ TURN), mode(shares[2], POSE @ APART))
-    own, found = ways_round(mode(shares[0]), others, BANANA, np.array([lead]), 0.3)
+    own, found = ways_round(mode(shares[0]), others, BANANA, turned_by(lead), 0.3)
     assert total(own, found) == pytest.approx(1.0)
     by_pose = {m.T_world_centre.tobytes(): m.share for m in found}
     wrong = norm.cdf(-lead / 0.3)
@@ -48,7 +52,7 @@ def test_what_depth_says_of_two_ways_round_goes_no_further_than_it_can_be_truste
 
 
 def test_a_way_that_the_keyframe_has_no_mode_of_is_the_pose_turned():
-    own, (other,) = ways_round(mode(1.0), (), BANANA, np.zeros(1), 0.3)
+    own, (other,) = ways_round(mode(1.0), (), BANANA, turned_by(0.0), 0.3)
     assert (own.share, other.share) == (pytest.approx(0.5, abs=0.01), pytest.approx(0.5, abs=0.01))
     np.testing.assert_allclose(other.T_world_centre, POSE @ TURN)
     # as uncertain as the pose, and more: the two surfaces aren't just the same
@@ -58,14 +62,14 @@ def test_a_way_that_the_keyframe_has_no_mode_of_is_the_pose_turned():
 
 def test_a_mode_of_a_view_that_is_turned_so_stands_for_its_way():
     near = mode(0.0, POSE @ TURN @ se3.exp(np.array([0.1, 0.0, 0.0, 0.004, 0.0, 0.0])))
-    _, (other,) = ways_round(mode(1.0), (near,), BANANA, np.zeros(1), 0.3)
+    _, (other,) = ways_round(mode(1.0), (near,), BANANA, turned_by(0.0), 0.3)
     assert other == replace(near, share=other.share)
     assert other.share == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_way_of_which_no_view_knows_is_none():
     own, others = mode(0.7), (mode(0.3, POSE @ APART),)
-    after, (turned, apart) = sorted_by_pose(*ways_round(own, others, BANANA, np.array([np.inf]), 0.3))
+    after, (turned, apart) = sorted_by_pose(*ways_round(own, others, BANANA, turned_by(np.inf), 0.3))
     assert (after.share, turned.share, apart.share) == (pytest.approx(0.7), 0.0, pytest.approx(0.3))
 
 
@@ -80,9 +84,33 @@ def test_the_lead_is_that_of_a_view_however_many_there_are(repeats):
     looks = [(k, np.stack([HERE, HERE @ upside_down, THERE]), [SEEN, SEEN - 10.0, EMPTY]) for k in range(repeats)]
     looks.append((repeats, (HERE @ upside_down)[None], [SEEN]))
     mug = thing(1, *looks)
-    np.testing.assert_allclose(leads(mug, 0, HERE, RECORDING, MODEL), [10.0])
-    np.testing.assert_allclose(leads(mug, 0, HERE @ upside_down, RECORDING, MODEL), [-10.0])
-    assert leads(mug, 1, HERE, RECORDING, MODEL) == np.inf
+    assert other_ways(mug, 0, HERE, RECORDING, MODEL).lead == pytest.approx([10.0])
+    assert other_ways(mug, 0, HERE @ upside_down, RECORDING, MODEL).lead[0] == pytest.approx(-10.0)
+    assert other_ways(mug, 1, HERE, RECORDING, MODEL).lead == np.inf
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.4, 2.0])
+def test_a_way_that_the_views_hardly_tell_apart_is_one_however_many_views_there_are(behind):
+    """Half hidden, a thing may lie on its side, elsewhere: no near-symmetry of a mug's."""
+    lying = HERE @ se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.03, 0.0, 0.0]))
+    looks = [(k, np.stack([HERE, lying]), [SEEN, SEEN - behind]) for k in range(4)]
+    ways = other_ways(thing(1, *looks), 0, HERE, RECORDING, MODEL)
+    np.testing.assert_allclose((HERE @ ways.T_own_way)[-1], lying, atol=1e-9)
+    assert ways.lead[-1] == pytest.approx(behind)
+    own, others = ways_round(mode(0.9, HERE), (mode(0.1, lying),), MODEL.shapes[0], ways, 0.3)
+    at_least = min(norm.cdf(-behind / 0.3) / norm.sf(-behind / 0.3), 0.98)
+    (other,) = (m for m in others if m.T_world_centre is lying)
+    assert other.share / own.share == pytest.approx(max(at_least, 1.0 / 9.0))
+
+
+def test_a_way_that_most_views_have_not_kept_is_as_far_behind_as_they_can_tell():
+    lying = HERE @ se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.03, 0.0, 0.0]))
+    once = (0, np.stack([HERE, lying]), [SEEN, SEEN])
+    few = other_ways(thing(1, once, *((k, HERE, SEEN) for k in (1, 2, 3))), 0, HERE, RECORDING, MODEL)
+    assert few.lead[-1] == pytest.approx(0.75 * SEEN)
+    beside = [HERE @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01 * n, 0.0, 0.0])) for n in range(4)]
+    full = [(k, np.stack(beside), SEEN - np.arange(4.0)) for k in (1, 2, 3)]
+    assert other_ways(thing(1, once, *full), 0, HERE, RECORDING, MODEL).lead[-1] == pytest.approx(0.75 * 3.0)
 
 
 # --- alike things ---

@@ -10,9 +10,14 @@ from ctmap_gtsam.filtering.particles import Particles
 from ctmap_gtsam.frontend.proposer import PoseModes
 from ctmap_gtsam.smoothing.belief import judge
 from ctmap_gtsam.smoothing.modes import Sighting
+from ctmap_gtsam.smoothing.rounds import wanted_of
+from factors.symmetry import near
+from sequences import se3
 from sequences.types import Detection
 from tests.ctmap_gtsam.scenes import model_of
-from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, thing
+from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, stays, thing
+
+MUG = MODEL.shapes[0]
 
 
 def moved(keyframes=(0, 2, 3, 5, 6)):
@@ -82,3 +87,27 @@ def test_between_classes_that_explain_as_much_but_for_their_meshes_error_the_det
         0, classes, scores, np.zeros(2), 0.0, 0.0, -np.inf, 0, 0, 0, 0, np.ones(3), True, 8, None
     )  # fmt: skip
     assert (np.argmax(filtered.class_log_evidence(model)) == 1) == named
+
+
+def test_a_place_is_claimed_by_what_is_seen_there_in_that_visit():
+    """However much other visits, and other places in the same visit, say for another thing."""
+    strong = thing(
+        1, *((k, T, nats * SEEN) for k, (T, nats) in enumerate([(HERE, 9)] * 2 + [(THERE, 1)] + [(THERE, 9)] * 5))
+    )
+    weak = stays(0, THERE, range(4))
+    assert strong.log_evidence > weak.log_evidence
+    own = [strong.claim_at(k) / SEEN for k in range(8)]
+    assert own == pytest.approx([18.0] * 2 + [10.0] * 2 + [36.0] * 4)
+    lone = thing(1, (0, HERE, 9 * SEEN), (2, THERE, SEEN), *((k, THERE, 9 * SEEN) for k in range(4, 8)))
+    assert lone.claim_at(2) < weak.claim_at(2) == pytest.approx(4 * SEEN)
+
+
+def test_a_view_tries_the_way_round_that_those_beside_it_take():
+    """And no more of what it has tried: neither the same way nor what is far off in time."""
+    turned = HERE @ se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
+    both = np.stack([HERE, turned])
+    mug = thing(0, (0, HERE, SEEN), (1, both, [SEEN, SEEN]), (2, HERE, SEEN), (3, HERE, SEEN))
+    tried = [wanted_of(mug, k, MODEL, lambda c, k=k: mug.modes_at(c, k)).starts[0] for k in range(4)]
+    there = [bool(near(turned, starts, MUG.symmetry, 0.1, 0.01).any()) for starts in tried]
+    assert there == [True, True, True, False]
+    assert [len(starts) for starts in tried] == [3, 3, 3, 2]

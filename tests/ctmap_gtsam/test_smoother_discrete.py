@@ -191,11 +191,40 @@ def test_more_views_of_one_thing_are_more_evidence_for_it_and_not_less():
     assert (np.diff(grown) > 0).all()
 
 
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10**6), st.integers(2, 4), st.integers(1, 4))
+def test_a_hump_counts_once_however_many_modes_it_has(seed, times, views):
+    """Modes found again and again in one place say no more than one: neither of the class nor of which place it is."""
+    rng = np.random.default_rng(seed)
+    T = se3.make(np.eye(3), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    covariance = np.tile(1e-4 * np.eye(6), (2, 1, 1))
+    once = [Stage(k, 0.2 * k, T, covariance, 40.0 + rng.normal(size=2)) for k in range(views)]
+    again = [0] + [1] * times
+    often = [
+        replace(s, T_world_centre=T[again], covariance=covariance[again], log_evidence=s.log_evidence[again])
+        for s in once
+    ]
+    a, b = solve(once, USUAL, MUG, STILL), solve(often, USUAL, MUG, STILL)
+    assert b.log_evidence == pytest.approx(a.log_evidence, abs=1e-9)
+    for before, after in zip(a.modes, b.modes, strict=True):
+        assert after[0] == pytest.approx(before[0], abs=1e-9)
+        assert after[1 : 1 + times].sum() == pytest.approx(before[1], abs=1e-9)
+
+
+def test_modes_along_a_ridge_say_no_more_than_the_ridge():
+    """Of a ridge that depth leaves flat a few modes stand side by side: they count for less than their sum."""
+    T = se3.make(np.eye(3), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    covariance = np.tile(np.diag([1e-4] * 3 + [4e-4, 1e-4, 1e-4]), (3, 1, 1))
+    stages = [Stage(k, 0.2 * k, T, covariance, np.full(3, 60.0)) for k in range(20)]
+    shares = solve(stages, USUAL, MUG, STILL).modes[10][:3]
+    assert 0.25 < shares[:2].sum() / shares[2] < 4.0  # each counted in full, it would be a million
+
+
 def test_a_wide_mode_doesnt_win_for_being_wide_only():
     """Two modes of one height: the shares are those of their volumes. At equal mass they are equal."""
     covariance = np.stack([1e-4 * np.eye(6), 4e-4 * np.eye(6)])
     volumes = np.array([0.0, 6 * np.log(2.0)])
-    T = np.tile(np.eye(4), (2, 1, 1))
+    T = se3.make(np.eye(3), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
     alike = solve([Stage(0, 0.0, T, covariance, 80.0 - volumes)], MODEL, MUG, STILL).modes[0]
     high = solve([Stage(0, 0.0, T, covariance, np.full(2, 80.0))], MODEL, MUG, STILL).modes[0]
     assert alike[0] == pytest.approx(alike[1])
