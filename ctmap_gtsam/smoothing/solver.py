@@ -2,7 +2,8 @@
 
 GTSAM's own optimisers copy all of Values for every call of a Python factor; `graph.linearize(values)` on Values that
 Python owns does not. So the loop is ours, and linearisation, elimination and marginals are GTSAM's. Levenberg's
-damping (1944); undamped while that works. A step is that of `elimination.Blocks`, and a long run is never held linear as a whole.
+damping (1944); undamped while that works. Steps are those of `elimination.Blocks`: of a long run no more is held linear
+than some keyframes.
 """
 
 from __future__ import annotations
