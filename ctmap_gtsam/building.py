@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -42,7 +43,8 @@ class Tables:
     in_view: NDArray[np.bool_] = field(init=False)
     modes: list[tuple[Any, ...]] = field(default_factory=list)
     moves: list[tuple[Any, ...]] = field(default_factory=list)
-    ledger: list[tuple[Any, ...]] = field(default_factory=list)
+    ledger: tuple[array[Any], ...] = field(default_factory=lambda: tuple(array(kind) for kind in "qqqqd"))
+    """columns of numbers: a keyframe has dozens of lines, and a line's tuple is four times as large as what it says"""
 
     def __post_init__(self) -> None:
         # an object nobody has an opinion of yet has any class
@@ -72,7 +74,8 @@ class Tables:
 
     def note(self, row: int, keyframe: int, potential: str, nats: float, other: int = -1) -> None:
         """Add a line of the ledger; row -1 is no object's, other -1 no neighbour's."""
-        self.ledger.append((row, keyframe, POTENTIALS.index(potential), other, nats))
+        for column, number in zip(self.ledger, (row, keyframe, POTENTIALS.index(potential), other, nats), strict=True):
+            column.append(number)
 
 
 def build_estimate(
@@ -113,7 +116,7 @@ def build_estimate(
         camera_covariance=camera_covariance,
         modes=Modes(*_columns(tables.modes, (np.int64,) * 3 + (np.float64,) * 4, ((),) * 4 + ((4, 4), (6, 6), (6, 3)))),
         moves=Moves(*_columns(tables.moves, _MOVE_TYPES, ((), (2,), (), (2,), (), ()))),
-        ledger=Ledger(*_columns(tables.ledger, (np.int64,) * 4 + (np.float64,), ((),) * 5)),
+        ledger=Ledger(*(np.array(column, dtype=column.typecode) for column in tables.ledger)),
         meta=meta,
     )
 

@@ -38,8 +38,8 @@ class Terms(Protocol):
     def linearised(self, values: Sequence[Array]) -> Linearised:
         """At values (..., 4, 4) of poses or (..., 6) of vectors, one for each key."""
 
-    def __getitem__(self, index: int) -> Terms:
-        """One of a batch (n,): batch shape ()."""
+    def __getitem__(self, index: int | slice) -> Terms:
+        """One of a batch (n,): batch shape (); or some of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Modes:
         R = self.whitener
         return (R @ r[..., None])[..., 0], (R @ J_camera, R @ J_object, *(-R for _ in bias))
 
-    def __getitem__(self, index: int) -> Modes:
+    def __getitem__(self, index: int | slice) -> Modes:
         """See `Terms`."""
         return replace(self, T_camera_mode=self.T_camera_mode[index], information=self.information[index])
 
@@ -120,7 +120,7 @@ class Predictions:
         R = self.whitener
         return (R @ r[..., None])[..., 0], (R @ (J_a if turned is None else J_a @ turned), R @ J_b)
 
-    def __getitem__(self, index: int) -> Predictions:
+    def __getitem__(self, index: int | slice) -> Predictions:
         """See `Terms`."""
         reference = None if self.T_reference is None else self.T_reference[index]
         return replace(self, sigma=self.sigma[index], T_reference=reference)
@@ -154,7 +154,7 @@ class Drifts:
         rho, weight = self.rho[..., None], 1.0 / self.sigma[..., None]
         return (e_b - rho * e_a) / self.sigma, (-rho[..., None] * weight * J_a, weight * J_b)
 
-    def __getitem__(self, index: int) -> Drifts:
+    def __getitem__(self, index: int | slice) -> Drifts:
         """See `Terms`."""
         return Drifts(self.recorded_a[index], self.recorded_b[index], self.rho[index], self.sigma[index])
 
@@ -181,7 +181,7 @@ class Gauges:
         r, J = gauge_residual(self.T_reference, values[0], self.symmetry)
         return r / self.sigma_rad, (J / self.sigma_rad,)
 
-    def __getitem__(self, index: int) -> Gauges:
+    def __getitem__(self, index: int | slice) -> Gauges:
         """See `Terms`."""
         return replace(self, T_reference=self.T_reference[index])
 
@@ -213,7 +213,7 @@ class Standings:
         J = np.concatenate([turned, np.zeros_like(turned)], axis=-1)
         return weight[..., None] * (up @ self.level.T), (weight[..., None, None] * J,)
 
-    def __getitem__(self, index: int) -> Standings:
+    def __getitem__(self, index: int | slice) -> Standings:
         """See `Terms`."""
         return replace(self, sigma_rad=self.sigma_rad[index], keyframes=self.keyframes[index])
 
@@ -245,7 +245,7 @@ class Contexts:
         by_distance = (share * slope)[..., None, None]
         return (share * e)[..., None], (by_distance * J_a[..., None, :], by_distance * J_b[..., None, :])
 
-    def __getitem__(self, index: int) -> Contexts:
+    def __getitem__(self, index: int | slice) -> Contexts:
         """See `Terms`."""
         return Contexts(self.centres[index], self.pair[index], self.instance[index], self.keyframes[index])
 
@@ -298,6 +298,6 @@ class Partners:
             jacobians.append(share[..., None, None] * np.concatenate(rows, axis=-2))
         return share[..., None] * np.concatenate([e[..., None], f[..., None] * x], axis=-1), tuple(jacobians)
 
-    def __getitem__(self, index: int) -> Partners:
+    def __getitem__(self, index: int | slice) -> Partners:
         """See `Terms`."""
         return replace(self, pair=self.pair[index], candidates=self.candidates[index], keyframes=self.keyframes[index])

@@ -194,7 +194,7 @@ def _solved(things: Mapping[int, _Object], recording: Recording, model: Model) -
     built = build(model, cameras, recording.run.localisation, objects)
     for row in objects:
         _hold(built, row, things[row], recording)
-    return smooth(built, model, objects, len(recording.keyframes))
+    return smooth(built, model, len(recording.keyframes))
 
 
 def _hold(built: SmootherGraph, row: int, one: _Object, recording: Recording) -> None:

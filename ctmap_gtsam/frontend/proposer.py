@@ -83,23 +83,57 @@ class View:
         return replace(self, tile=coarser(self.tile, COARSE), samples=self.samples * COARSE**2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # a map holds one for each object, class and keyframe
 class PoseModes:
     """Maxima of the measurement potential for one class in one view, best first: n of them."""
 
-    T_camera_centre: Array
-    """(n, 4, 4)"""
-    log_likelihood: Array
-    """(n,) tempered depth ratio plus the box's, nats"""
-    depth_log_ratio: Array
-    """(n,) the depth's part of it"""
-    covariance: Array
-    """(n, 6, 6) of the right tangent, from the score's own shape"""
-    witness: Array
-    """(n,) what the view's box or its absence says for a known thing there against a look-alike, nats"""
+    numbers: Array
+    """(55 n,) of all that is said below, one after the other: five small arrays are as large as what is in them"""
+
+    @classmethod
+    def of(
+        cls,
+        T_camera_centre: Array,
+        log_likelihood: Array,
+        depth_log_ratio: Array,
+        covariance: Array,
+        witness: Array,
+    ) -> PoseModes:
+        """Modes of what the properties say."""
+        told = (T_camera_centre, covariance, log_likelihood, depth_log_ratio, witness)
+        return cls(np.concatenate([numbers.ravel() for numbers in told]))
+
+    @property
+    def T_camera_centre(self) -> Array:
+        """(n, 4, 4)."""
+        return self._told(0, 16).reshape(-1, 4, 4)
+
+    @property
+    def covariance(self) -> Array:
+        """(n, 6, 6) of the right tangent, from the score's own shape."""
+        return self._told(16, 52).reshape(-1, 6, 6)
+
+    @property
+    def log_likelihood(self) -> Array:
+        """(n,) tempered depth ratio plus the box's, nats."""
+        return self._told(52, 53)
+
+    @property
+    def depth_log_ratio(self) -> Array:
+        """(n,) the depth's part of it."""
+        return self._told(53, 54)
+
+    @property
+    def witness(self) -> Array:
+        """(n,) what the view's box or its absence says for a known thing there against a look-alike, nats."""
+        return self._told(54, 55)
+
+    def _told(self, begin: int, end: int) -> Array:
+        n = len(self)
+        return self.numbers[begin * n : end * n]
 
     def __len__(self) -> int:
-        return len(self.log_likelihood)
+        return len(self.numbers) // 55
 
 
 class Proposer:
@@ -238,7 +272,7 @@ class Proposer:
         poses = candidates[keep]
         covariance = self._shape_of_score(shape, view, poses, probe, [known.get(row) for row in keep])
         depth = view.share * self.model.kappa * scores.log_ratio[keep]
-        return PoseModes(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
+        return PoseModes.of(poses, score[keep], depth, covariance, self._witness(view, scores)[keep])
 
     def told(self, shape: Shape, view: View, T_camera_centre: Array) -> tuple[float, float]:
         """What depth and the detector say of one pose (4, 4), nats: for the ledger, and no hypothesis."""
@@ -605,4 +639,4 @@ def _widths(drop: Array) -> Array:
 
 
 def _no_modes() -> PoseModes:
-    return PoseModes(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 6, 6)), np.zeros(0))
+    return PoseModes(np.zeros(0))

@@ -240,15 +240,16 @@ class Thing:
         return np.concatenate([np.zeros((0, 4, 4)), *(stage.T_world_centre for stage in beside)])
 
     def to_start_from(self) -> Thing:
-        """The same without what only its graph and the estimate ask for: sightings' modes, and stages' covariances.
+        """The same without what only its graph and the estimate ask for: sightings' modes, and covariances.
 
         A map holds them for every object, class and keyframe, and the next round gathers as many again.
         """
-        unseen = np.zeros((0, 6, 6))
+        unseen, untold = np.zeros((0, 6, 6)), np.full((6, 6), np.nan)
         return replace(
             self,
             sightings={k: replace(s, modes=(), context=()) for k, s in self.sightings.items()},
             stages={c: tuple(replace(s, covariance=unseen) for s in stages) for c, stages in self.stages.items()},
+            poses={k: (T, untold) for k, (T, _) in self.poses.items()},
         )
 
     def with_poses(self, poses: Mapping[int, tuple[Array, Array]]) -> Thing:

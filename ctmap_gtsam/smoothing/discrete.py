@@ -35,7 +35,7 @@ PRESENT_AT_FIRST = 0.5
 _STAYED = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # a map holds one for each object, class and keyframe
 class Stage:
     """The states of one keyframe in view: n modes, unmeasured, and gone."""
 

@@ -23,7 +23,7 @@ from ctmap_gtsam.frontend.place import Place
 from ctmap_gtsam.frontend.proposer import FLAT_M, PROBED_M
 from ctmap_gtsam.model import Model
 from ctmap_gtsam.shapes import Shape
-from ctmap_gtsam.smoothing.batched import Batch, Problem
+from ctmap_gtsam.smoothing.batched import BLOCK, Batch, Problem, padded
 from ctmap_gtsam.smoothing.footing import footings
 from ctmap_gtsam.smoothing.marginals import covariances
 from ctmap_gtsam.smoothing.solver import Solution, optimise
@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 _EXACT = np.repeat([1e-5, 1e-5], 3)
 """rad, metres: how well a camera pose is known that is recorded without error"""
 _STRIDE = 1_000_000
+_KIND, _INDEX = 56, 2**56 - 1  # of a gtsam.Symbol: the bit at which its letter begins, and those of its index
 _FURTHEST = 1e8  # ratio of variances of an object-visit's shared error
 
 
@@ -120,6 +121,8 @@ class SmootherGraph:
     """gtsam.Values"""
     objects: dict[int, str] = field(default_factory=dict)
     """object -> its class's name"""
+    measured: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    """object -> the keyframes that it has a variable at, ascending"""
     _compiled: Any = field(default_factory=gtsam.NonlinearFactorGraph)
     _compiled_labels: list[Label] = field(default_factory=list)
     _batches: list[Batch] = field(default_factory=list)
@@ -142,27 +145,28 @@ class SmootherGraph:
     def labels(self) -> list[Label]:
         """What each factor is, in the order of `to_gtsam`."""
         return self._compiled_labels + [
-            Label(batch.kind, name, tuple(keys))
-            for batch in self._batches
-            for name, keys in zip(batch.names, batch.keys.tolist(), strict=True)
+            Label(batch.kind, batch.name(keys), tuple(keys)) for batch in self._batches for keys in batch.keys.tolist()
         ]
 
-    def problem(self) -> Problem:
-        """The same as the solver takes it."""
-        return Problem(self._compiled, self._batches, self.initial)
+    def problem(self, block: int = BLOCK) -> Problem:
+        """The same as the solver takes it, which eliminates so many keyframes together, or more."""
+        return Problem(self._compiled, self._batches, self.initial, keyframes_of, block)
 
     def to_gtsam(self) -> Any:
         """The same as a gtsam.NonlinearFactorGraph, with a CustomFactor for each that GTSAM has none for."""
         graph = gtsam.NonlinearFactorGraph()
         graph.push_back(self._compiled)
         for batch in self._batches:
-            for i, (name, keys) in enumerate(zip(batch.names, batch.keys.tolist(), strict=True)):
-                graph.add(terms_factor(name, keys, batch.terms[i]))
+            for i, keys in enumerate(batch.keys.tolist()):
+                graph.add(terms_factor(batch.name(keys), keys, batch.terms[i]))
         return graph
 
     def count(self) -> dict[str, int]:
         """Number of factors by kind."""
-        return dict(Counter(label.kind for label in self.labels))
+        count = Counter(label.kind for label in self._compiled_labels)
+        for batch in self._batches:
+            count[batch.kind] += len(batch)
+        return dict(count)
 
     def edges(self, values: Any) -> list[Edges]:
         """Measurements and predictions as relative poses, with symmetries and biases as they are at given values.
@@ -185,21 +189,30 @@ class SmootherGraph:
 
     def contributions(self, values: Any) -> Contributions:
         """What each factor says at given values, in the order of `labels`."""
-        labels = self.labels
-        variables = [[Variable.of(key) for key in label.keys] for label in labels]
-        begun: dict[Variable, int] = {}
-        for label, own in zip(labels, variables, strict=True):
-            if label.kind == "measurement":
-                begun[own[-1]] = min(own[0].index, begun.get(own[-1], own[0].index))
-        keyframes = [max(begun.get(v, 0) if v.kind == "b" else v.index for v in own) for own in variables]
-        objects = [[*sorted({v.row for v in own if v.row is not None}), -1, -1] for own in variables]
+        kinds = [label.kind for label in self._compiled_labels]
+        groups = [padded([label.keys for label in self._compiled_labels])]
+        for batch in self._batches:
+            kinds += [batch.kind] * len(batch)
+            groups.append(batch.keys)
+        begun = self._begun()
+        objects = np.concatenate([_lowest_rows(keys) for keys in groups])
         return Contributions(
-            kind=tuple(label.kind for label in labels),
-            object=np.array([those[0] for those in objects], dtype=np.int64),
-            keyframe=np.array(keyframes, dtype=np.int64),
-            other=np.array([those[1] for those in objects], dtype=np.int64),
+            kind=tuple(kinds),
+            object=objects[:, 0],
+            keyframe=np.concatenate([_latest(keys, begun) for keys in groups]),
+            other=objects[:, 1],
             nats=-self.errors(values),
         )
+
+    def _begun(self) -> dict[int, int]:
+        """b_iv -> the keyframe of its first measurement."""
+        begun: dict[int, int] = {}
+        for batch in self._batches:
+            if batch.kind == "measurement":
+                for bias in np.unique(batch.keys[:, -1]).tolist():
+                    first = int(keyframes_of(batch.keys[batch.keys[:, -1] == bias, 0]).min())
+                    begun[bias] = min(first, begun.get(bias, first))
+        return begun
 
     def energy(self, values: Any) -> dict[str, float]:
         """Error by kind at given values, nats."""
@@ -308,6 +321,48 @@ def bias_key(row: int, visit: int) -> int:
     return int(gtsam.symbol("b", row * _STRIDE + visit))
 
 
+def name_of(keys: Sequence[int]) -> str:
+    """What errors and tables call a factor of some keys: its objects and the latest of their keyframes, or cameras."""
+    variables = [Variable.of(key) for key in keys]
+    placed = [v for v in variables if v.kind == "o"]
+    if not placed:
+        return "cameras " + " and ".join(str(v.index) for v in variables)
+    rows = [str(row) for row in sorted({v.row or 0 for v in placed})]
+    return f"object{'s'[: len(rows) - 1]} {' and '.join(rows)} keyframe {max(v.index for v in placed)}"
+
+
+def keyframes_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keyframe of each of some keys (n,) of cameras and objects, -1 for b_iv."""
+    index = keys & _INDEX
+    kind = keys >> _KIND
+    return np.where(kind == ord("x"), index, np.where(kind == ord("o"), index % _STRIDE, -1))
+
+
+def _rows_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Object of each of some keys, -1 for cameras."""
+    return np.where(keys >> _KIND == ord("x"), -1, (keys & _INDEX) // _STRIDE)
+
+
+def _latest(keys: NDArray[np.int64], begun: Mapping[int, int]) -> NDArray[np.int64]:
+    """(n,) the latest keyframe of each factor's variables, by keys (n, a); b_iv is of the one that it begins with."""
+    keyframes = keyframes_of(keys)
+    timeless = keyframes < 0
+    keyframes[timeless] = [begun.get(key, 0) for key in keys[timeless].tolist()]
+    return np.asarray(keyframes.max(axis=1, initial=0))
+
+
+def _lowest_rows(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n, 2) the lowest two objects that each factor concerns, by its variables' keys (n, a); -1 for none."""
+    none = np.iinfo(np.int64).max
+    rows = _rows_of(keys)
+    rows[rows < 0] = none
+    first = rows.min(axis=1, initial=none)
+    second = np.where(rows > first[:, None], rows, none).min(axis=1, initial=none)
+    lowest = np.stack([first, second], axis=1)
+    lowest[lowest == none] = -1
+    return lowest
+
+
 def build(
     model: Model,
     cameras: Sequence[Camera],
@@ -339,34 +394,28 @@ def build(
     _add_cameras(built, cameras, noise, first)
     for row, (shape, measured) in objects.items():
         built.objects[row] = shape.source.name
+        built.measured[row] = tuple(m.keyframe for m in measured)
         _add_object(built, model, row, shape, measured, cameras, place if model.context else None)
     if model.context:
         _add_context(built, model, objects, first, company or {})
     return built
 
 
-def smooth(
-    built: SmootherGraph,
-    model: Model,
-    objects: Mapping[int, tuple[Shape, Sequence[Measured]]],
-    n: int,
-    first: int = 0,
-) -> Smoothed:
+def smooth(built: SmootherGraph, model: Model, n: int, first: int = 0) -> Smoothed:
     """Solve and take the marginals of the keyframes from `first` to n - 1."""
     settings = model.config.smoother
     problem = built.problem()
     solution = optimise(problem, built.initial, max_iterations=settings.max_iterations, tolerance=settings.tolerance)
     keys = [camera_key(k) for k in range(first, n)]
-    keys += [object_key(row, m.keyframe) for row, (_, measured) in objects.items() for m in measured]
-    covariance_of = covariances(problem.linearize(solution.values), keys)
+    keys += [object_key(row, k) for row, measured in built.measured.items() for k in measured]
+    covariance_of = covariances(problem.blocks(solution.values), keys)
+    del problem
 
     def read(key: int) -> tuple[Array, Array]:
         return solution.values.atPose3(key).matrix(), covariance_of[key]
 
     cameras = [read(camera_key(k)) for k in range(first, n)]
-    poses = {
-        row: {m.keyframe: read(object_key(row, m.keyframe)) for m in measured} for row, (_, measured) in objects.items()
-    }
+    poses = {row: {k: read(object_key(row, k)) for k in measured} for row, measured in built.measured.items()}
     T, covariance = (np.stack([camera[i] for camera in cameras]) for i in range(2))
     return Smoothed(solution, T, covariance, poses, built.contributions(solution.values))
 
@@ -397,8 +446,7 @@ def _drifts(drifting: Sequence[int], cameras: Sequence[Camera], noise: Localisat
     fresh = sigmas * np.sqrt(np.maximum(1.0 - rho**2, 1e-6))[:, None]
     recorded = [np.stack([c.T_world_camera for c in those]) for those in (before, after)]
     keys = np.array([(camera_key(k - 1), camera_key(k)) for k in drifting])
-    names = tuple(f"cameras {k - 1} and {k}" for k in drifting)
-    return Batch("localisation", names, keys, Drifts(recorded[0], recorded[1], rho, fresh))
+    return Batch("localisation", keys, Drifts(recorded[0], recorded[1], rho, fresh), name_of)
 
 
 def _add_object(
@@ -416,7 +464,6 @@ def _add_object(
     recorded = np.stack([cameras[m.keyframe].T_world_camera for m in measured])
     T = recorded @ np.stack([m.T_camera_centre for m in measured])
     keys = np.array([object_key(row, m.keyframe) for m in measured])
-    names = tuple(f"object {row} keyframe {m.keyframe}" for m in measured)
     old = int(built.initial.exists(int(keys[0])))  # the first, where it is carried
     if old:
         T[0] = built.initial.atPose3(int(keys[0])).matrix()
@@ -424,10 +471,10 @@ def _add_object(
     T = _one_image(T, S)
     if len(measured) > old:
         new = slice(old, None)
-        _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new], names[new])
+        _add_measurements(built, model, row, shape, measured[new], recorded[new], T[new], keys[new])
         if place is not None:
-            _add_standing(built, model, shape, place, measured[new], T[new], keys[new], names[new])
-    _add_predictions(built, model, S, measured, keys, names)
+            _add_standing(built, model, shape, place, measured[new], T[new], keys[new])
+    _add_predictions(built, model, S, measured, keys)
 
 
 def _add_measurements(
@@ -439,7 +486,6 @@ def _add_measurements(
     recorded: Array,
     T: Array,
     keys: NDArray[np.int64],
-    names: tuple[str, ...],
 ) -> None:
     for key, pose in zip(keys.tolist(), T, strict=True):
         built.initial.insert(key, gtsam.Pose3(pose))
@@ -450,9 +496,9 @@ def _add_measurements(
     seen_by = [(camera_key(m.keyframe), key, bias_key(row, m.visit)) for m, key in zip(measured, keys, strict=True)]
     information = np.linalg.inv(np.stack([m.covariance for m in measured]))
     modes = Modes(se3.inverse(recorded) @ T, information, S)
-    built.add_batch(Batch("measurement", names, np.array(seen_by), modes))
+    built.add_batch(Batch("measurement", np.array(seen_by), modes, name_of))
     if S.free:
-        built.add_batch(Batch("gauge", names, keys[:, None], Gauges(T, S)))
+        built.add_batch(Batch("gauge", keys[:, None], Gauges(T, S), name_of))
 
 
 def _add_standing(
@@ -463,7 +509,6 @@ def _add_standing(
     measured: Sequence[Measured],
     T: Array,
     keys: NDArray[np.int64],
-    names: tuple[str, ...],
 ) -> None:
     """That it stands flat while it stays: a fact spread over the keyframes between which it can't have tipped."""
     up = place.up_world
@@ -472,11 +517,11 @@ def _add_standing(
     for footing in footings(T, [m.stays for m in measured], shape, place, model):
         assert up is not None
         time_s = np.array([measured[i].time_s for i in footing.rows])
-        shared = (np.abs(time_s[:, None] - time_s) <= as_one_s).sum(axis=1)
+        # row by row: all pairs at once are the square of a long run
+        shared = np.array([np.count_nonzero(np.abs(time_s - t) <= as_one_s) for t in time_s])
         sigma = np.full(len(shared), tilt)
-        at = tuple(names[i] for i in footing.rows)
         terms = Standings(footing.level, up, sigma, shared)
-        built.add_batch(Batch("standing", at, keys[footing.rows, None], terms))
+        built.add_batch(Batch("standing", keys[footing.rows, None], terms, name_of))
 
 
 def _one_image(T: Array, S: symmetry.Symmetry) -> Array:
@@ -493,7 +538,6 @@ def _add_predictions(
     S: symmetry.Symmetry,
     measured: Sequence[Measured],
     keys: NDArray[np.int64],
-    names: Sequence[str],
 ) -> None:
     stays = [i for i in range(1, len(measured)) if measured[i].stays]
     if not stays:
@@ -504,10 +548,11 @@ def _add_predictions(
         pairs = np.stack([keys[[i - 1, i]] for i in stays])
         start = np.stack([built.initial.atPose3(key).matrix() for key in pairs[:, 0].tolist()])
         terms = Predictions(sigma, S, start if S.free else None)
-        built.add_batch(Batch("prediction", tuple(names[i] for i in stays), pairs, terms))
+        built.add_batch(Batch("prediction", pairs, terms, name_of))
         return
     for i, covariance in zip(stays, sigma, strict=True):
-        built.add("prediction", names[i], stay_factor(int(keys[i - 1]), int(keys[i]), covariance))
+        pair = int(keys[i - 1]), int(keys[i])
+        built.add("prediction", name_of(pair), stay_factor(*pair, covariance))
 
 
 def shared_flatness(covariances: Array, radius_m: float) -> Array:
@@ -568,10 +613,10 @@ def _add_context(
     n = len(pairs)
     of = np.array([(objects[a][0].index, objects[b][0].index) for a, b, _, _ in pairs])
     related = model.relations[of[:, 0], of[:, 1]]
-    terms = Contexts(np.zeros((n, 2, 3)), related, np.zeros(n), np.array([shared for *_, shared in pairs]))
+    centres, nothing = np.broadcast_to(0.0, (n, 2, 3)), np.broadcast_to(0.0, n)
+    terms = Contexts(centres, related, nothing, np.array([shared for *_, shared in pairs]))
     keys = np.array([(object_key(a, k), object_key(b, k)) for a, b, k, _ in pairs])
-    names = tuple(f"objects {a} and {b} keyframe {k}" for a, b, k, _ in pairs)
-    built.add_batch(Batch("context", names, keys, terms))
+    built.add_batch(Batch("context", keys, terms, name_of))
 
 
 def _partner(company: Company, a: int, b: int, classes: tuple[int, int]) -> Partner | None:
@@ -589,5 +634,5 @@ def _add_partners(
     related = model.relations[np.full(n, c_a), np.full(n, c_b)]
     symmetries = model.shapes[c_a].symmetry, model.shapes[c_b].symmetry
     terms = Partners(related, partner.relation, symmetries, np.full(n, float(partner.candidates)), np.full(n, shared))
-    names = tuple(f"objects {pair[0]} and {pair[1]} keyframe {k}" for k in at)
-    built.add_batch(Batch("context", names, np.array([(object_key(a, k), object_key(b, k)) for k in at]), terms))
+    keys = np.array([(object_key(a, k), object_key(b, k)) for k in at])
+    built.add_batch(Batch("context", keys, terms, name_of))

@@ -127,12 +127,12 @@ def _counting(sighting: Sighting, times: float) -> Sighting:
     """A sighting as of a view that counts so many times as much."""
 
     def more(modes: PoseModes | None) -> PoseModes | None:
-        return modes and replace(
-            modes,
-            log_likelihood=times * modes.log_likelihood,
-            depth_log_ratio=times * modes.depth_log_ratio,
-            covariance=modes.covariance / times,
-            witness=times * modes.witness,
+        return modes and PoseModes.of(
+            modes.T_camera_centre,
+            times * modes.log_likelihood,
+            times * modes.depth_log_ratio,
+            modes.covariance / times,
+            times * modes.witness,
         )
 
     modes = tuple(more(m) for m in sighting.modes)

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
+from ctmap_gtsam.smoothing.elimination import Blocks
+
 Array = NDArray[np.float64]
 
 _SIZE = 6
@@ -38,6 +40,10 @@ class Joint:
         rows = np.array([self.rows[key] for key in keys], dtype=np.int64)[:, None] + np.arange(_SIZE)
         return self.covariance[np.ix_(rows.ravel(), rows.ravel())]
 
+    def marginal(self, keys: Sequence[int]) -> Joint:
+        """Of some of the variables alone."""
+        return Joint((), {key: _SIZE * i for i, key in enumerate(keys)}, self.of(keys))
+
 
 @dataclass
 class _Branch:
@@ -51,30 +57,72 @@ class _Branch:
     """in all of it"""
 
 
-def covariances(linear: Any, keys: Sequence[int]) -> dict[int, Array]:
+def covariances(blocks: Blocks, keys: Sequence[int]) -> dict[int, Array]:
     """Key -> marginal covariance (6, 6): gtsam.Marginals' but for rounding.
 
     Args:
-        linear: gtsam.GaussianFactorGraph over variables of 6 numbers; given up as soon as it is eliminated, if nobody
-            else holds it.
+        blocks: the linear system.
         keys: of which variables.
     """
-    tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-    del linear
     asked = set(keys)
     out: dict[int, Array] = {}
-    for joint in joints(tree, keys):
-        out.update((key, joint.of([key])) for key in joint.frontals if key in asked)
+    messages = blocks.messages()
+    later: Joint | None = None
+    while messages:
+        message = messages.pop()
+        handed = () if message is None else tuple(message.keys())
+        of_block, later = _of_block(blocks, len(messages), message, asked, handed, later)
+        out.update(of_block)
     return out
 
 
-def joints(tree: Any, keys: Sequence[int]) -> Iterator[Joint]:
+def _of_block(
+    blocks: Blocks, block: int, message: Any, asked: set[int], handed: tuple[int, ...], later: Joint | None
+) -> tuple[dict[int, Array], Joint | None]:
+    """Covariances of a block's own variables that are asked for, and what those together are that it was handed.
+
+    Args:
+        blocks: the linear system.
+        block: which.
+        message: what it is handed by the blocks before it.
+        asked: keys.
+        handed: keys of the message.
+        later: what its neighbours in later blocks are together; None = there are none.
+    """
+    tree = _tree(blocks, block, message)
+    out: dict[int, Array] = {}
+    before: Joint | None = None
+    for joint in joints(tree, [key for key in blocks.own[block].tolist() if key in asked or key in handed], later):
+        out.update((key, joint.of([key])) for key in joint.frontals if key in asked)
+        # a message is one factor, so one clique has all of its variables
+        if handed and before is None and joint.rows.keys() >= set(handed):
+            before = joint.marginal(handed)
+    if handed and before is None:  # they all go on
+        assert later is not None
+        before = later.marginal(handed)
+    return out, before
+
+
+def _tree(blocks: Blocks, block: int, message: Any) -> Any:
+    """gtsam.GaussianBayesTree of a block's own variables, given those of later blocks."""
+    linear = blocks.graph(block, message)
+    if block < len(blocks.own) - 1:
+        return linear.eliminatePartialMultifrontal(blocks.own[block].tolist())[0]
+    return linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
+
+
+def joints(tree: Any, keys: Sequence[int], later: Joint | None = None) -> Iterator[Joint]:
     """What the cliques of a gtsam.GaussianBayesTree say that have some keys, and all above them; parents first.
 
     Of a clique's branches the largest is last, and then nobody needs the clique any more: of n cliques no more than
     log2(n) + 2 are held at once.
+
+    Args:
+        tree: of some variables, given others.
+        keys: of the some.
+        later: of the others; None = there are none.
     """
-    ahead: list[tuple[_Branch, Joint | None]] = [(root, None) for root in _branches(tree, keys)]
+    ahead: list[tuple[_Branch, Joint | None]] = [(root, later) for root in _branches(tree, keys)]
     while ahead:
         branch, above = ahead.pop()
         joint = _joint(branch.clique.conditional(), above)
@@ -113,7 +161,7 @@ def _joint(conditional: Any, above: Joint | None) -> Joint:
     n, own = len(R), len(R) // _SIZE
     rows = {key: _SIZE * i for i, key in enumerate(keys)}
     root = _solved(R, np.eye(n))
-    if above is None:
+    if above is None or own == len(keys):
         return Joint(tuple(keys[:own]), rows, root @ root.T)
     covariance = np.empty((_SIZE * len(keys),) * 2)
     shared = covariance[n:, n:] = above.of(keys[own:])

@@ -77,7 +77,7 @@ class Look:
     """whether it is the object's first"""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # a map holds one for each object and keyframe
 class Sighting:
     """One object in one keyframe in whose view it should be."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,11 +24,10 @@ from ctmap_gtsam.model import Model
 from ctmap_gtsam.runtime.checkpoint import Checkpoint
 from ctmap_gtsam.runtime.settings import to_dict
 from ctmap_gtsam.runtime.sources import code
-from ctmap_gtsam.shapes import Shape
 from ctmap_gtsam.smoothing.association import Expected, associate
 from ctmap_gtsam.smoothing.belief import Thing, judge
 from ctmap_gtsam.smoothing.discrete import Posterior, Stage
-from ctmap_gtsam.smoothing.graph import Contributions, Measured, Smoothed, SmootherGraph, build, smooth
+from ctmap_gtsam.smoothing.graph import Contributions, Smoothed, SmootherGraph, build, smooth
 from ctmap_gtsam.smoothing.identity import join_moved, merge_duplicates
 from ctmap_gtsam.smoothing.modes import Boxes, Recording, Sighting, Wanted, gather, record
 from ctmap_gtsam.smoothing.rounds import (
@@ -49,7 +48,6 @@ from sequences.progress import SILENT, Progress
 from sequences.types import Detection, Run
 
 Array = NDArray[np.float64]
-Objects = Mapping[int, tuple[Shape, Sequence[Measured]]]
 Look = Callable[[SmootherGraph, Smoothed], object]
 """Who looks at the last round's graph and its solution"""
 
@@ -69,9 +67,9 @@ class Map:
     company: Mapping[int, Company]
     """visit -> who was moved together before it, by the round before"""
 
-    def to_start_from(self) -> Map:
-        """The same without what the next round doesn't ask for."""
-        return replace(self, things={i: thing.to_start_from() for i, thing in self.things.items()})
+    def to_start_from(self) -> dict[int, Thing]:
+        """What the next round asks for."""
+        return {i: thing.to_start_from() for i, thing in self.things.items()}
 
 
 @dataclass(frozen=True)
@@ -108,9 +106,9 @@ class Outline:
     """(4, 4)"""
 
 
-def outlines(current: Map) -> dict[int, Outline]:
+def outlines(things: Mapping[int, Thing]) -> dict[int, Outline]:
     """Of all objects of a map."""
-    return {i: Outline(thing.best_class, thing.exists, thing.anchor) for i, thing in current.things.items()}
+    return {i: Outline(thing.best_class, thing.exists, thing.anchor) for i, thing in things.items()}
 
 
 _KEPT = (
@@ -158,21 +156,23 @@ def smooth_run(
     state: Rounds | None = None if checkpoint is None else checkpoint.load()
     if state is None:
         found = _first_look(recording, proposer, seeds(forward, model), told)
+        del forward  # of a long run it is as much as what was found in the images
         state = _stepped(_solve(recording, model, found), None, [], proposer, checkpoint)
         del found
     proposer.hypotheses_scored = state.hypotheses_scored
     while not _enough(state, config):
         # of all that was kept of a long run, nothing is held any longer than the next step asks for it
-        state = replace(state, current=state.current.to_start_from())
-        found = _next_look(recording, proposer, state.current, told, f"round {len(state.energies) + 1}")
-        before, energies = outlines(state.current), state.energies
+        things, energies = state.current.to_start_from(), state.energies
         del state
+        found = _next_look(recording, proposer, things, told, f"round {len(energies) + 1}")
+        before = outlines(things)
+        del things
         state = _stepped(_solve(recording, model, found), before, energies, proposer, checkpoint)
         del found
     current = state.current
     if look is not None:
-        built, objects = _graph(recording, model, current.things, current.company)
-        look(built, smooth(built, model, objects, len(recording.keyframes)))
+        built = _graph(recording, model, current.things, current.company)
+        look(built, smooth(built, model, len(recording.keyframes)))
     estimate = write(recording, model, current.things, current.smoothed, _diagnostics(proposer, state))
     if checkpoint is not None:
         checkpoint.remove()
@@ -187,7 +187,7 @@ def _stepped(
     checkpoint: Checkpoint | None,
 ) -> Rounds:
     """The state after a round, which is kept; None = before it there was no map."""
-    settled = before is not None and _settled(before, outlines(following), proposer.model)
+    settled = before is not None and _settled(before, outlines(following.things), proposer.model)
     state = Rounds(following, [*energies, dict(following.energy)], proposer.hypotheses_scored, settled)
     if checkpoint is not None:
         checkpoint.save(state)
@@ -237,23 +237,25 @@ def _first_look(recording: Recording, proposer: Proposer, seeds: Mapping[int, Se
     return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, "round 1"), {})
 
 
-def _next_look(recording: Recording, proposer: Proposer, current: Map, progress: Progress, name: str) -> Found:
+def _next_look(
+    recording: Recording, proposer: Proposer, things: Mapping[int, Thing], progress: Progress, name: str
+) -> Found:
     """Start from the smoothed map; every object's background is the map of the others."""
     model = proposer.model
     visits = visits_of(recording)
-    company = company_of(current.things, visits, recording.place.up_world, model)
+    company = company_of(things, visits, recording.place.up_world, model)
 
     def expected(i: int, k: int) -> Expected | None:
-        return expected_of(current.things[i], k)
+        return expected_of(things[i], k)
 
     def wanted(i: int, k: int) -> Wanted | None:
-        thing = current.things[i]
+        thing = things[i]
         return wanted_of(thing, k, model, lambda c: thing.modes_at(c, k))
 
     def around(k: int) -> Surroundings:
-        return Surroundings(neighbours_of(current.things, k, model), recording.place.surfaces, company[visits[k]])
+        return Surroundings(neighbours_of(things, k, model), recording.place.surfaces, company[visits[k]])
 
-    boxes = associate(recording, model, current.things, expected)
+    boxes = associate(recording, model, things, expected)
     return Found(boxes, gather(recording, proposer, wanted, boxes, around, progress, name), company)
 
 
@@ -262,8 +264,8 @@ def _solve(recording: Recording, model: Model, found: Found) -> Map:
     boxes, sightings, company = found.boxes, found.sightings, found.company
     things = {i: judge(i, boxes[i], sightings[i], recording, model) for i in boxes if sightings[i]}
     things = join_moved(merge_duplicates(things, recording, model), recording, model)
-    built, objects = _graph(recording, model, things, company)
-    smoothed = smooth(built, model, objects, len(recording.keyframes))
+    built = _graph(recording, model, things, company)
+    smoothed = smooth(built, model, len(recording.keyframes))
     things = {i: thing.with_poses(smoothed.objects.get(i, {})) for i, thing in things.items()}
     # the arrays are all that anybody needs from here on, and GTSAM's values can't be kept
     smoothed = replace(smoothed, solution=replace(smoothed.solution, values=None))
@@ -272,11 +274,11 @@ def _solve(recording: Recording, model: Model, found: Found) -> Map:
 
 def _graph(
     recording: Recording, model: Model, things: Mapping[int, Thing], company: Mapping[int, Company]
-) -> tuple[SmootherGraph, Objects]:
-    """The graph of all that is, and what each object was taken for."""
+) -> SmootherGraph:
+    """The graph of all that is."""
     cameras = [camera_of(recording, k) for k in range(len(recording.keyframes))]
     objects = objects_of(things, recording, model)
-    return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place), objects
+    return build(model, cameras, recording.run.localisation, objects, company=company, place=recording.place)
 
 
 def _settled(a: Mapping[int, Outline], b: Mapping[int, Outline], model: Model) -> bool:

@@ -2,7 +2,8 @@
 
 GTSAM's own optimisers copy all of Values for every call of a Python factor; `graph.linearize(values)` on Values that
 Python owns does not. So the loop is ours, and linearisation, elimination and marginals are GTSAM's. Levenberg's
-damping (1944) in a unit in which a radian weighs as much as `LEVER_M` metres; undamped while that works.
+damping (1944); undamped while that works. Steps are those of `elimination.Blocks`: of a long run no more is held linear
+than some keyframes.
 """
 
 from __future__ import annotations
@@ -10,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import gtsam
 import numpy as np
 
-LEVER_M = 0.1
-"""how far from an object's centre its surface is, more or less: what a turn of a radian moves"""
+from ctmap_gtsam.smoothing.batched import Problem
+from ctmap_gtsam.smoothing.elimination import Blocks
 
 _FIRST, _GROWTH, _LAST = 1e-2, 100.0, 1e14
 _MORE = 10.0  # so much more than it fell by may a converged problem's linearisation promise
@@ -46,17 +46,17 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
         max_iterations: accepted steps at most.
         tolerance: relative fall of the energy at which it is converged.
     """
-    energy = graph.error(values)
+    problem = graph if isinstance(graph, Problem) else Problem(graph, (), values)
+    energy = problem.error(values)
     trace = [energy]
-    damping, ordering = 0.0, None
+    damping = 0.0
     for _ in range(max_iterations):
-        linear = graph.linearize(values)
-        ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        linear = problem.blocks(values)
         moved = None
         while damping < _LAST:
-            step = _step(linear, ordering, values, damping)
+            step = linear.step(damping)
             moved = None if step is None else values.retract(step)
-            after = np.inf if moved is None else graph.error(moved)
+            after = np.inf if moved is None else problem.error(moved)
             if np.isfinite(after) and after <= energy:
                 break
             moved = None
@@ -68,7 +68,7 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
         trace.append(after)
         if fell <= little:
             # a step that is damped enough falls by little anywhere: what would a full one do?
-            full = step if damping <= _FIRST else _full_step(linear, ordering, values)
+            full = step if damping <= _FIRST else _full_step(linear)
             if full is not None and energy - linear.error(full) <= _MORE * little:
                 return Solution(moved, after, "converged", tuple(trace))
         values, energy = moved, after
@@ -80,22 +80,7 @@ def optimise(graph: Any, values: Any, *, max_iterations: int, tolerance: float) 
     return Solution(values, energy, "cap", tuple(trace))
 
 
-def _full_step(linear: Any, ordering: Any, values: Any) -> Any:
+def _full_step(linear: Blocks) -> Any:
     """The step with the least damping that the system can be solved with."""
-    undamped = _step(linear, ordering, values, 0.0)
-    return undamped if undamped is not None else _step(linear, ordering, values, _FIRST)
-
-
-def _step(linear: Any, ordering: Any, values: Any, damping: float) -> Any:
-    """The damped step (gtsam.VectorValues), None where the system is singular."""
-    damped = linear
-    if damping > 0.0:
-        damped = gtsam.GaussianFactorGraph()
-        damped.push_back(linear)
-        for key in values.keys():  # noqa: SIM118 (gtsam.Values isn't a mapping)
-            scale = np.sqrt(damping) * np.repeat([1.0, 1.0 / LEVER_M], 3)
-            damped.add(key, np.diag(scale), np.zeros(6), gtsam.noiseModel.Unit.Create(6))
-    try:
-        return damped.optimize(ordering)
-    except RuntimeError:
-        return None
+    undamped = linear.step(0.0)
+    return undamped if undamped is not None else linear.step(_FIRST)

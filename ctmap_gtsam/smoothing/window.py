@@ -80,7 +80,7 @@ class Window:
         inside = {i: (shape, window._inside(i, measured)) for i, (shape, measured) in objects.items()}
         inside = {i: entry for i, entry in inside.items() if entry[1]}
         built = build(model, cameras, noise, inside, window.carried, company, place)
-        smoothed = smooth(built, model, inside, len(cameras), self.first)
+        smoothed = smooth(built, model, len(cameras), self.first)
         begin = len(cameras) + 1 - self.length
         return smoothed, window._slid(begin, built, smoothed.solution.values, inside, cameras)
 

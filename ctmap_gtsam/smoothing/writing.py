@@ -242,10 +242,10 @@ def note_graph(tables: Tables, rows: Mapping[int, int], graph: Contributions, ke
         graph: of the solution; what a window carries on from before it is no factor of a keyframe.
         keyframes: of which factors are written.
     """
-    columns = (graph.kind, graph.object.tolist(), graph.keyframe.tolist(), graph.other.tolist(), graph.nats.tolist())
+    columns = graph.kind, graph.object, graph.keyframe, graph.other, graph.nats
     for kind, i, k, j, nats in zip(*columns, strict=True):
-        if kind in GRAPH_POTENTIALS and k in keyframes:
-            tables.note(rows.get(i, -1), k, kind, nats, rows.get(j, -1))
+        if kind in GRAPH_POTENTIALS and int(k) in keyframes:
+            tables.note(rows.get(int(i), -1), int(k), kind, float(nats), rows.get(int(j), -1))
 
 
 def note_class(tables: Tables, row: int, thing: Thing) -> None:

@@ -48,7 +48,7 @@ class GaussianProposer:
         k = view.k
         there = [k] if k in self.measured else []
         n = len(there)
-        return PoseModes(
+        return PoseModes.of(
             np.array([self.measured[i] for i in there]).reshape(n, 4, 4),
             np.zeros(n),
             np.zeros(n),

@@ -44,7 +44,7 @@ def solved(names=("cereal_box", "soup_can")):
             ],
         )
     built = build(model, cameras, LocalisationNoise(0.003, 0.004, 3.0), objects)
-    return built, smooth(built, model, objects, K).solution.values
+    return built, smooth(built, model, K).solution.values
 
 
 @pytest.fixture(scope="module")

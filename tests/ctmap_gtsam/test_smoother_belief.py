@@ -30,7 +30,7 @@ def numbers(owner):
     """Bytes of all that is held of the views."""
     arrays = [a for stages in owner.stages.values() for s in stages for a in (s.T_world_centre, s.covariance)]
     modes = [m for s in owner.sightings.values() for m in s.modes if m is not None]
-    return sum(a.nbytes for a in arrays) + sum(a.nbytes for m in modes for a in vars(m).values())
+    return sum(a.nbytes for a in arrays) + sum(m.numbers.nbytes for m in modes)
 
 
 @given(st.sets(st.integers(0, 7), min_size=1), st.integers(-2, 10))
@@ -75,7 +75,7 @@ def test_between_classes_that_explain_as_much_but_for_their_meshes_error_the_det
     covariance = np.diag(np.repeat([1e-4, 1e-6], 3))[None]
 
     def modes(nats):
-        return PoseModes(HERE[None], np.array([nats]), np.array([nats]), covariance, np.array([2.0]))
+        return PoseModes.of(HERE[None], np.array([nats]), np.array([nats]), covariance, np.array([2.0]))
 
     sightings = {k: Sighting(k, tuple(map(modes, nats)), (np.zeros(1),) * 2, 0.0) for k, nats in views.items()}
     assert (judge(0, boxes, sightings, RECORDING, model).best_class == 1) == named

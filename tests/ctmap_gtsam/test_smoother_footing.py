@@ -88,7 +88,7 @@ def graph(n, tilt, place=FLOOR, model=MODEL):
     objects = {0: (BOX, measured(tilted(BOX, tilt), n, covariance))}
     cameras = [Camera(np.eye(4), 0.2 * k, 0) for k in range(n)]
     built = build(model, cameras, LocalisationNoise(), objects, place=place)
-    return built, smooth(built, model, objects, n)
+    return built, smooth(built, model, n)
 
 
 def tilt_of(smoothed, k):

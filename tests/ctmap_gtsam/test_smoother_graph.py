@@ -130,7 +130,7 @@ def rauch_tung_striebel(problem):
 def solved(problem, model=MODEL, shape=MUG):
     objects = {0: (shape, problem.modes())}
     built = build(model, problem.cameras(), problem.noise, objects)
-    return built, smooth(built, model, objects, len(problem.times))
+    return built, smooth(built, model, len(problem.times))
 
 
 @settings(max_examples=8)
@@ -188,7 +188,7 @@ def test_a_turn_that_no_view_shows_stays_open_however_many_there_are(n):
     spread[:3, :3] += open_rad**2 * np.outer(turn, turn)
     cameras, measured = views_with(spread, n)
     objects = {0: (MUG, measured)}
-    found = smooth(build(model, cameras, LocalisationNoise(0.0, 0.0, 1.0), objects), model, objects, n)
+    found = smooth(build(model, cameras, LocalisationNoise(0.0, 0.0, 1.0), objects), model, n)
     covariance = found.objects[0][0][1][:3, :3]
     assert np.sqrt(turn @ covariance @ turn) > 0.95 * open_rad
     across = np.cross(turn, [0.0, 0.0, 1.0])
@@ -218,7 +218,7 @@ def test_a_move_cuts_the_track_and_what_is_left_shares_only_the_bias():
     shift = se3.make(np.eye(3), np.array([1.0, 0.0, 0.0]))
     moved = modes[:cut] + [replace(m, T_camera_centre=m.T_camera_centre @ shift) for m in modes[cut:]]
     other = build(MODEL, problem.cameras(), problem.noise, {0: (MUG, moved)})
-    before, after = (smooth(b, MODEL, objects, len(problem.times)) for b in (built, other))
+    before, after = (smooth(b, MODEL, len(problem.times)) for b in (built, other))
     for i, m in enumerate(modes):
         shift = (after.objects[0][m.keyframe][0] - before.objects[0][m.keyframe][0])[0, 3]
         assert shift == pytest.approx(float(i >= cut), abs=1e-7)
@@ -268,7 +268,7 @@ def test_it_doesnt_matter_in_which_of_the_equivalent_poses_a_mode_is_written(nam
     for some in (modes, plain):
         objects = {0: (shape, some)}
         built = build(model, cameras, LocalisationNoise(), objects)
-        answers.append(smooth(built, model, objects, len(cameras)))
+        answers.append(smooth(built, model, len(cameras)))
     assert answers[0].solution.energy == pytest.approx(answers[1].solution.energy, abs=1e-6)
     for k in range(len(cameras)):
         r = residual(answers[0].objects[0][k][0], answers[1].objects[0][k][0], shape.symmetry)
@@ -285,9 +285,7 @@ def test_moving_the_whole_world_moves_the_answer():
     objects = {0: (MUG, problem.modes())}
     here = problem.cameras()
     there = [replace(c, T_world_camera=G @ c.T_world_camera) for c in here]
-    a, b = (
-        smooth(build(MODEL, cameras, problem.noise, objects), MODEL, objects, len(here)) for cameras in (here, there)
-    )
+    a, b = (smooth(build(MODEL, cameras, problem.noise, objects), MODEL, len(here)) for cameras in (here, there))
     for k in problem.measured:
         np.testing.assert_allclose(b.objects[0][k][0], G @ a.objects[0][k][0], atol=1e-7)
         np.testing.assert_allclose(b.objects[0][k][1], a.objects[0][k][1], rtol=1e-4, atol=1e-14)
@@ -324,7 +322,7 @@ def test_a_free_turn_is_marked_wide_and_the_rest_is_not():
     shape, cameras, modes, _, _ = tangled(4, replace(symmetry, offsets=0 * symmetry.offsets))
     model = Model(classes("mug"), config_of(), context=False)
     objects = {0: (shape, modes)}
-    smoothed = smooth(build(model, cameras, LocalisationNoise(), objects), model, objects, len(cameras))
+    smoothed = smooth(build(model, cameras, LocalisationNoise(), objects), model, len(cameras))
     covariance = smoothed.objects[0][2][1]
     free = shape.symmetry.free_axes[:, 0]
     assert np.sqrt(free @ covariance @ free) > 0.5
@@ -391,7 +389,7 @@ def test_how_wide_the_gauge_is_says_nothing_of_what_isnt_free(name):
             replace(batch, terms=replace(batch.terms, sigma_rad=sigma)) if batch.kind == "gauge" else batch
             for batch in built.batches
         ]
-        answers.append(smooth(built, model, objects, len(cameras)))
+        answers.append(smooth(built, model, len(cameras)))
     assert [a.solution.end for a in answers] == ["converged"] * 2
     assert max(len(a.solution.trace) for a in answers) < 8
     P = symmetry.projection

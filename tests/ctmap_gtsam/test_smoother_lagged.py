@@ -103,7 +103,7 @@ def test_what_was_carried_of_an_object_is_another_objects_where_the_trellis_chan
     assert late
     smoothed, _ = window.solve(MODEL, problem.cameras(), problem.noise, {0: (MUG, changed), 1: (MUG, modes)})
     objects = {0: (MUG, late), 1: (MUG, modes), 2: (MUG, old)}
-    batch = smooth(build(MODEL, problem.cameras(), problem.noise, objects), MODEL, objects, len(problem.times))
+    batch = smooth(build(MODEL, problem.cameras(), problem.noise, objects), MODEL, len(problem.times))
     for i in (0, 1):
         for m in late:
             (T, covariance), (T_batch, covariance_batch) = (s.objects[i][m.keyframe] for s in (smoothed, batch))

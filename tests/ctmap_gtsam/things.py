@@ -36,7 +36,7 @@ def thing(object_id, *looks):
     def sighting(k, T, nats):
         value = np.atleast_1d(nats)
         spread = np.broadcast_to(covariance, (len(value), 6, 6))
-        modes = PoseModes(T.reshape(-1, 4, 4), value, value, spread, np.where(value > 0, 2.0, -2.0))
+        modes = PoseModes.of(T.reshape(-1, 4, 4), value, value, spread, np.where(value > 0, 2.0, -2.0))
         return Sighting(k, (modes,), (np.zeros(len(value)),), 0.0)
 
     boxes = {k: BOX for k, _, nats in looks if np.max(nats) > 0}

@@ -9,7 +9,7 @@ import multiprocessing
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -23,10 +23,6 @@ from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.smoothing.smoother import smooth_run
 from sequences.bop import load_run
-
-METHODS: dict[str, Callable[..., Estimate]] = {"filter": filter_run, "smooth": smooth_run}
-"""the smoother takes the filter's estimate, too"""
-
 
 WARM = 4  # keyframes of a first run, which loads kernels and builds what is built once
 
@@ -83,15 +79,18 @@ def _work(connection: Connection, method: str, folder: Path, keyframes: int, con
     warm = filter_run(looped(round_, WARM), config)
     if smooth:
         smooth_run(looped(round_, WARM), warm, config)
-    given = (Estimate.load(forward(folder, keyframes)),) if smooth else ()
-    run, estimator = looped(round_, keyframes), METHODS[method]
+    begins = forward(folder, keyframes)
+    run = looped(round_, keyframes)
     clock = _Clock()
-    estimate = estimator(run, *given, config, progress=clock)
+    if smooth:  # which holds what it begins with no longer than it needs it
+        estimate = smooth_run(run, Estimate.load(begins), config, progress=clock)
+    else:
+        estimate = filter_run(run, config, progress=clock)
     seconds = time.process_time() - clock.began
     each = tuple(float(s) for s in np.diff([clock.began, *clock.ticks]))
     measured = Measured(seconds, each, peak_mb(), len(estimate.object_id))
     if not smooth:
-        estimate.save(forward(folder, keyframes))
+        estimate.save(begins)
     connection.send(measured)
 
 
