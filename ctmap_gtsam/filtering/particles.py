@@ -42,10 +42,7 @@ _GROWTHS = 8  # of a mode, at most
 _MEANS = 4  # fixed-point steps for a mean; poses of one mode need fewer than five
 _STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
 _MODES = 4  # of one class, at most
-_LIGHT = (
-    1e-3,
-    0.3,
-)  # weight, and share of the mean weight: a mode whose heaviest particle weighs less than both is none
+_LIGHT = 1e-3, 0.3  # weight, and share of the mean: a mode whose heaviest particle weighs less than both is none
 _SPARSE = 2.0  # a kernel so much wider than the prediction closes gaps that the prediction would leave
 _DIMENSIONS = 6
 _NOTHING = 40.0  # nats: what is so far behind the largest adds nothing to a sum in float64
