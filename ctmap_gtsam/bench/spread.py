@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from ctmap_gtsam.comparing import run_methods
 from ctmap_gtsam.config import Config
+from ctmap_gtsam.evaluation.frames import FrameErrors
 from ctmap_gtsam.evaluation.record import pooled, record
 from sequences.bop import load_run
 from sequences.errors import InputError
@@ -48,7 +50,7 @@ def run(
 
     Returns:
         `<method>.<run>.<metric>.median`, `.low` and `.high` (the extremes) over the seeds that have the metric; metrics
-        that none has are left out.
+        that none has are left out. Of two methods `<second> - <first>.<run>.mssd_mm_paired`, see `paired`.
 
     Raises:
         InputError: no run is given, or one has no truth.
@@ -60,13 +62,17 @@ def run(
     with progress.stage("spread", total=len(judged) * seeds) as stage:
         for recording, truth in judged:
             told: dict[str, list[Mapping[str, float | None]]] = {name: [] for name in methods}
+            ahead: dict[str, list[Mapping[str, float | None]]] = {f"{b} - {a}": [] for a, b in combinations(methods, 2)}
             for seed in range(config.seed, config.seed + seeds):
                 shown = disturbed(recording, DISTURBED, seed) if disturb else recording
                 outcomes = run_methods(shown, methods, replace(config, seed=seed), progress=progress)
+                records = {name: record(shown, truth, name, outcomes[name].estimate) for name in methods}
                 for name in methods:
-                    told[name].append(pooled([record(shown, truth, name, outcomes[name].estimate)]))
+                    told[name].append(pooled([records[name]]))
+                for a, b in combinations(methods, 2):
+                    ahead[f"{b} - {a}"].append({"mssd_mm_paired": paired(records[a].frames, records[b].frames)})
                 stage.advance()
-            for name, tables in told.items():
+            for name, tables in (told | ahead).items():
                 figures |= {f"{name}.{recording.name}.{key}": value for key, value in spread(tables).items()}
     return figures
 
@@ -81,6 +87,15 @@ def spread(tables: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
                 f"{metric}.{name}": float(f(values)) for name, f in (("median", np.median), ("low", min), ("high", max))
             }
     return out
+
+
+def paired(first: FrameErrors, second: FrameErrors) -> float | None:
+    """By how much the second's MSSD is larger, mm: the median over object-frames where both have the true class.
+
+    None where there is no such object-frame.
+    """
+    both = first.class_correct & second.class_correct & np.isfinite(first.mssd_m) & np.isfinite(second.mssd_m)
+    return 1e3 * float(np.median((second.mssd_m - first.mssd_m)[both])) if both.any() else None
 
 
 def disturbed(run: Run, noise: LocalisationNoise, seed: int) -> Run:

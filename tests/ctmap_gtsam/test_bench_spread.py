@@ -1,5 +1,7 @@
 """Laws of the spread: what changes is the seed alone, and a disturbed camera errs as its run says."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,18 @@ def test_the_extremes_hold_the_median_and_what_no_table_has_is_left_out():
     ]
     told = spread.spread(tables)
     assert told == {"a.median": 2.0, "a.low": 1.0, "a.high": 5.0, "c.median": 2.5, "c.low": 2.0, "c.high": 3.0}
+
+
+def test_a_paired_difference_is_of_the_object_frames_that_both_name_rightly():
+    """Each frame is held to itself: a method that is worse by a millimetre everywhere is so, however errors scatter."""
+    rng = np.random.default_rng(0)
+    mssd, right = rng.uniform(0.0, 0.1, 50), rng.random(50) < 0.7
+    a = SimpleNamespace(mssd_m=mssd, class_correct=right)
+    b = SimpleNamespace(mssd_m=np.where(right, mssd + 1e-3, 9.0), class_correct=np.ones(50, dtype=bool))
+    b.mssd_m[np.flatnonzero(right)[0]] = np.inf
+    assert spread.paired(a, b) == pytest.approx(1.0)
+    assert spread.paired(b, a) == pytest.approx(-1.0)
+    assert spread.paired(a, SimpleNamespace(mssd_m=mssd, class_correct=~right)) is None
 
 
 def test_a_disturbed_camera_errs_by_what_its_run_says_and_another_in_each_seed():
