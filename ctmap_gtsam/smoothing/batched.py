@@ -40,7 +40,7 @@ class Batch:
         return len(self.keys)
 
 
-BLOCK = 100
+BLOCK = 1000
 """keyframes that are eliminated together, at least: a run that is shorter than two blocks is one"""
 
 
