@@ -131,6 +131,7 @@ class Problem:
         variables = [np.searchsorted(keys, own) for own in (of_compiled, *(batch.keys for batch in batches))]
         first = _blocks_of(np.full(len(keys), -1) if keyframes is None else keyframes(keys), block)
         (in_compiled, *in_batches), last = cut(first, variables)
+        self._orders: list[Any] = []
         self._own = [keys[last == n] for n in range(last.max(initial=0) + 1)]
         self._compiled_in = [compiled] if len(self._own) == 1 else _split(compiled, in_compiled, len(self._own))
         self._pieces = [
@@ -166,7 +167,7 @@ class Problem:
                         piece.linearize(at, linear)
             return linear
 
-        return Blocks(self._own, make)
+        return Blocks(self._own, make, self._orders)
 
     def _read(self, values: Any) -> _Point:
         rows = gtsam.utilities.extractPose3(values)

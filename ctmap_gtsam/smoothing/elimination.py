@@ -29,11 +29,19 @@ class Blocks:
     """keys of each block, ascending: those that no factor of a later block has"""
     make: Callable[[int], Any] = field(repr=False)
     """block -> gtsam.GaussianFactorGraph of its factors, whose variables are its own or later blocks'"""
+    orders: list[Any] = field(default_factory=list, repr=False)
+    """the gtsam.Ordering of the last block, once found: it hangs on the factors' variables alone"""
 
     @cached_property
     def last(self) -> Any:
         """gtsam.GaussianFactorGraph of the last block's factors: where one block is all, it is made once."""
         return self.make(len(self.own) - 1)
+
+    def ordering(self, linear: Any) -> Any:
+        """In which order the last block is eliminated (gtsam.Ordering), by its gtsam.GaussianFactorGraph."""
+        if not self.orders:
+            self.orders.append(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
+        return self.orders[0]
 
     def graph(self, block: int, before: Any) -> Any:
         """gtsam.GaussianFactorGraph of a block's factors and of the message that it is handed."""
@@ -60,8 +68,7 @@ class Blocks:
     def _step(self, damping: float) -> Any:
         messages = self.messages(damping)
         linear = self.graph(len(messages) - 1, messages.pop())
-        ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-        step = _damped(linear, self.own[-1], damping).optimize(ordering)
+        step = _damped(linear, self.own[-1], damping).optimize(self.ordering(linear))
         del linear
         while messages:
             self._solve_back(len(messages) - 1, messages.pop(), damping, step)

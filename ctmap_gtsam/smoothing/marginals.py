@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
@@ -108,7 +107,7 @@ def _tree(blocks: Blocks, block: int, message: Any) -> Any:
     linear = blocks.graph(block, message)
     if block < len(blocks.own) - 1:
         return linear.eliminatePartialMultifrontal(blocks.own[block].tolist())[0]
-    return linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
+    return linear.eliminateMultifrontal(blocks.ordering(linear))
 
 
 def joints(tree: Any, keys: Sequence[int], later: Joint | None = None) -> Iterator[Joint]:
