@@ -35,12 +35,12 @@ class Neighbour:
     shape: Shape
     T_world_centre: Array
     """(4, 4)"""
-    log_evidence: float
-    """of its being there, nats, or what else says whose the place is: comparable among neighbours alone"""
+    claim: float
+    """by which of two in one place has it: evidence of its being there, nats, or the number of its boxes"""
 
     def yields_to(self, other: Neighbour) -> bool:
-        """Whether both claim the same space and the other has more evidence: the pixels there are the other's alone."""
-        stronger = (other.log_evidence, -other.object_id) > (self.log_evidence, -self.object_id)
+        """Whether both claim the same space and the other does so more strongly: the pixels there are its alone."""
+        stronger = (other.claim, -other.object_id) > (self.claim, -self.object_id)
         return stronger and self._contends(other)
 
     def _contends(self, other: Neighbour) -> bool:

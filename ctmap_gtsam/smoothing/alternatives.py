@@ -119,9 +119,7 @@ def other_ways(thing: Thing, visit: int, own: Array, recording: Recording, model
     c = thing.reported_class
     shape = model.shapes[c]
     stages = [
-        stage
-        for stage in thing.stages[c]
-        if recording.run.frames[int(recording.keyframes[stage.keyframe])].visit == visit and len(stage.log_evidence)
+        stage for stage in thing.stages[c] if recording.visit(stage.keyframe) == visit and len(stage.log_evidence)
     ]
     near = se3.make(np.concatenate([np.eye(3)[None], shape.near_symmetries]), np.zeros(3))
     turns = _with_found(near, own, stages, shape)
@@ -201,7 +199,7 @@ def exchanges(things: Mapping[int, Thing], recording: Recording, model: Model) -
 
 def _exchanged(a: Thing, b: Thing, recording: Recording, model: Model) -> dict[int, float]:
     """Visit -> P(an odd number of exchanges between it and the visit that names the two)."""
-    visits = [recording.run.frames[int(f)].visit for f in recording.keyframes]
+    visits = [recording.visit(k) for k in range(len(recording.keyframes))]
     n = max(visits) + 1
     handled = [_handled(thing, visits, n, recording, model) for thing in (a, b)]
     kept = 1.0 - 2.0 * model.config.smoother.exchange

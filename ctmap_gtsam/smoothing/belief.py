@@ -188,7 +188,7 @@ class Thing:
                 Measured(
                     stage.keyframe,
                     stage.time_s,
-                    recording.run.frames[int(recording.keyframes[stage.keyframe])].visit,
+                    recording.visit(stage.keyframe),
                     modes.T_camera_centre[state],
                     modes.covariance[state],
                     stays=stayed and bool(out),
@@ -226,18 +226,19 @@ class Thing:
 
     def modes_at(self, c: int, keyframe: int) -> Array:
         """(n, 4, 4) T_world_centre of the modes of class c at a keyframe; none where it wasn't in view."""
-        i = self.view_at(keyframe)
-        if c not in self.stages or i == len(self.keyframes) or self.keyframes[i] != keyframe:
-            return np.zeros((0, 4, 4))
-        return self.stages[c][i].T_world_centre
+        return self._modes_of_views(c, keyframe, (0,))
 
     def modes_beside(self, c: int, keyframe: int) -> Array:
-        """(n, 4, 4) T_world_centre of the modes of class c in the views before and after a keyframe that is one."""
+        """(n, 4, 4) the same of the views before and after a keyframe that is one."""
+        return self._modes_of_views(c, keyframe, (-1, 1))
+
+    def _modes_of_views(self, c: int, keyframe: int, away: Sequence[int]) -> Array:
+        """(n, 4, 4) of those so many views away from a keyframe; none where it wasn't in view."""
         i = self.view_at(keyframe)
         if c not in self.stages or i == len(self.keyframes) or self.keyframes[i] != keyframe:
             return np.zeros((0, 4, 4))
-        beside = self.stages[c][max(i - 1, 0) : i] + self.stages[c][i + 1 : i + 2]
-        return np.concatenate([np.zeros((0, 4, 4)), *(stage.T_world_centre for stage in beside)])
+        views = [i + step for step in away if 0 <= i + step < len(self.keyframes)]
+        return np.concatenate([np.zeros((0, 4, 4)), *(self.stages[c][view].T_world_centre for view in views)])
 
     def to_start_from(self) -> Thing:
         """The same without what only its graph and the estimate ask for: sightings' modes, and covariances.
@@ -294,7 +295,7 @@ def judge(
     solid, probability = model.existence(log_evidence, posed, clutter, witness, 0.0)
     # objects are what was detected: what has no box of its own left is what others are
     posterior = (solid if boxes else 0.0, probability)
-    visits = [recording.run.frames[int(recording.keyframes[k])].visit for k in keyframes]
+    visits = [recording.visit(k) for k in keyframes]
     claims = _claims(stages[best], posteriors[best], visits) if best in stages else np.zeros(len(keyframes))
     return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior, claims)
 
@@ -343,6 +344,6 @@ def _score_evidence(boxes: Boxes, recording: Recording, model: Model) -> Array:
     """(C,) what the detector's score vectors say, a persistent belief a visit."""
     by_visit: dict[int, Array] = {}
     for k, detection in sorted(boxes.items()):
-        visit = recording.run.frames[int(recording.keyframes[k])].visit
+        visit = recording.visit(k)
         by_visit[visit] = by_visit.get(visit, np.zeros(len(model.shapes))) + model.class_scores(detection)
     return np.asarray(sum((model.class_evidence(s) for s in by_visit.values()), np.zeros(len(model.shapes))))

@@ -54,6 +54,10 @@ class Recording:
         """(4, 4) as recorded."""
         return self.run.frames[int(self.keyframes[keyframe])].T_world_camera
 
+    def visit(self, keyframe: int) -> int:
+        """Which one it is of."""
+        return self.run.frames[int(self.keyframes[keyframe])].visit
+
     def time_s(self, keyframe: int) -> float:
         """Since the first keyframe."""
         frames = self.run.frames

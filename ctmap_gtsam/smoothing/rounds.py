@@ -89,13 +89,12 @@ def company_of(
 
 def visits_of(recording: Recording) -> tuple[int, ...]:
     """(K,) the visit of each keyframe."""
-    return tuple(recording.run.frames[int(f)].visit for f in recording.keyframes)
+    return tuple(recording.visit(k) for k in range(len(recording.keyframes)))
 
 
 def camera_of(recording: Recording, keyframe: int) -> Camera:
     """As recorded."""
-    visit = recording.run.frames[int(recording.keyframes[keyframe])].visit
-    return Camera(recording.T_world_camera(keyframe), recording.time_s(keyframe), visit)
+    return Camera(recording.T_world_camera(keyframe), recording.time_s(keyframe), recording.visit(keyframe))
 
 
 def objects_of(

@@ -126,11 +126,10 @@ def _belief(thing: Thing, k: int, held: Held, own: Mode, told: Told) -> Iterator
     seen = _alternatives(thing, c, held.view, recording, model)
     others = [mode for mode in seen if not own.says_the_same(mode, model.shapes[c])]
     own = replace(own, share=max(1.0 - sum(mode.share for mode in others), _LEAST))
-    visit = recording.run.frames[int(recording.keyframes[thing.keyframes[held.view]])].visit
+    visit = recording.visit(thing.keyframes[held.view])
     ways = told.other_ways(thing, visit, own.T_world_centre)
     own, turned = ways_round(own, others, model.shapes[c], ways, model.config.smoother.surface_nats)
-    visit = recording.run.frames[int(recording.keyframes[k])].visit
-    shares = told.exchanges.at(thing.object_id, visit)
+    shares = told.exchanges.at(thing.object_id, recording.visit(k))
     there = ((i, told.things[i]) for i in shares if told.things[i].presence_at(k) > 0.5)
     places = {i: _mode(other, at, told) for i, other in there if (at := other.held(k)) is not None}
     own, modes = elsewhere(own, turned, shares, places)

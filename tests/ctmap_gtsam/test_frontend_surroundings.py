@@ -100,7 +100,7 @@ def test_a_wall_carries_nothing_and_a_given_up_is_kept():
 
 
 def neighbour(i, shape, *where):
-    return Neighbour(i, shape, standing(shape, *where), log_evidence=0.0)
+    return Neighbour(i, shape, standing(shape, *where), claim=0.0)
 
 
 def poses_near(seed, n=5):

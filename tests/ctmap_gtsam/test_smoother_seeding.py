@@ -128,4 +128,4 @@ def test_neighbours_in_the_first_round_are_those_that_were_there_then(run):
     for k in range(KEYFRAMES):
         beside = seed.neighbour(k, 1.0, MODEL)
         assert (beside is not None) == (k < 3)
-    assert seed.neighbour(0, 7.0, MODEL).log_evidence == 7.0
+    assert seed.neighbour(0, 7.0, MODEL).claim == 7.0

@@ -19,11 +19,10 @@ SEEN, EMPTY = 60.0, -40.0
 """log-likelihoods of a pose where the thing is, and where it should show and doesn't"""
 RECORDING = SimpleNamespace(
     keyframes=np.arange(8),
-    run=SimpleNamespace(
-        frames=[SimpleNamespace(visit=k // 4) for k in range(8)], localisation=LocalisationNoise(1e-4, 1e-4)
-    ),
+    run=SimpleNamespace(localisation=LocalisationNoise(1e-4, 1e-4)),
     place=SimpleNamespace(surfaces=()),
     T_world_camera=lambda k: np.eye(4),
+    visit=lambda k: k // 4,
     time_s=lambda k: (k // 4) * DAY + k,
 )
 """two visits of four keyframes, a day apart"""
