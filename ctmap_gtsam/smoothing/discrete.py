@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +60,18 @@ class Posterior:
     """(n + 2,) marginal of each stage's states: modes, unmeasured, gone"""
     path: tuple[int, ...]
     """the most probable states, given where it is likelier there than gone; n stands for unmeasured, n + 1 for gone"""
+    path_stays: tuple[bool, ...]
+    """(stages - 1,) whether the path's own two states are one place rather than two"""
     moved: Array
     """(stages - 1,) probability that the object was there at either of two stages and did not simply stay"""
 
     def stayed(self, i: int) -> bool:
-        """Whether it more likely stayed from the stage before stage i to that one."""
-        return bool(self.moved[i - 1] < _STAYED)
+        """Whether it more likely stayed from the stage before stage i to that one, and the path says so, too.
+
+        Among many ways to have stayed the one best path may still be a jump. What the path calls two places must not be
+        held together: a graph that did would tear at everything else.
+        """
+        return bool(self.moved[i - 1] < _STAYED) and self.path_stays[i - 1]
 
 
 def solve(
@@ -100,7 +107,9 @@ def solve(
     total = float(log_sum(forward[-1]))
     marginals = tuple(np.exp(f + b - total) for f, b in zip(forward, backward, strict=True))
     moved = [_moved(step, forward[i], emissions[i + 1] + backward[i + 1], total) for i, step in enumerate(steps)]
-    return Posterior(total, marginals, _best_path(start, emissions, steps, marginals), np.array(moved))
+    path = _best_path(start, emissions, steps, marginals)
+    stays = tuple(step.stays(a, b) for step, (a, b) in zip(steps, pairwise(path), strict=True))
+    return Posterior(total, marginals, path, stays, np.array(moved))
 
 
 @dataclass(frozen=True)
@@ -111,6 +120,13 @@ class _Step:
     """(n + 1, m + 1) the part of transitions among modes and unmeasured in which the object stayed"""
     log_appear: Array
     """(m,) the other part of each transition to a mode, whatever was before: it came from elsewhere"""
+
+    def stays(self, a: int, b: int) -> bool:
+        """Whether from state a to state b it more likely stayed than came from elsewhere."""
+        n, m = (size - 1 for size in self.log_stay.shape)
+        if a > n or b > m:  # gone
+            return False
+        return b == m or bool(self.log_stay[a, b] > self.log_appear[b])
 
 
 def _emission(stage: Stage, model: Model, shape: Shape) -> Array:

@@ -288,6 +288,22 @@ def test_what_is_seen_elsewhere_from_some_view_on_has_moved_there():
     np.testing.assert_allclose(posterior.moved, np.arange(9) == 4, atol=0.01)
 
 
+def test_two_places_are_not_held_together_because_nobody_knows_when_it_left_the_first():
+    """Any of four steps may be the one in which it moved, so that it more likely stayed over each; the path jumps."""
+    places = np.concatenate([at(0, 0.0, x).T_world_centre for x in (0.0, 0.5)])
+    either = [
+        Stage(k, float(k), places, np.tile(at(0, 0.0, 0.0).covariance, (2, 1, 1)), np.full(2, 45.0))
+        for k in range(3, 6)
+    ]
+    stages = [at(k, float(k), 0.0) for k in range(3)] + either + [at(k, float(k), 0.5) for k in range(6, 9)]
+    posterior = solve(stages, USUAL, MUG, STILL)
+    x = [stage.T_world_centre[state, 0, 3] for stage, state in zip(stages, posterior.path, strict=True)]
+    jumps = np.flatnonzero(np.diff(x) > 0.4) + 1
+    assert len(jumps) == 1
+    assert (posterior.moved < 0.4).all()
+    assert [i for i in range(1, 9) if not posterior.stayed(i)] == jumps.tolist()
+
+
 def test_what_was_known_before_a_move_says_nothing_of_the_new_place():
     """The evidence is that of both places apart and of the move, however vague the views: 3 m away, a day later."""
     model = Model(classes("mug"), config_of("smoother.unmeasured=0.0"))
