@@ -234,8 +234,17 @@ class Model:
             )
         return np.log1p(-d.detection_probability * visible) - np.log1p(-d.clutter_rate * visible)
 
+    def seen_in_visit(self, witness: float) -> float:
+        """What a visit says for a known thing against a look-alike, nats, for its views' sum of `witness`.
+
+        What a detector misses it misses again: a table under a cloth isn't found in any view of a visit, and each
+        tells no more than the one before (`detector.overlooked`).
+        """
+        share = self.config.detector.overlooked
+        return float(np.logaddexp(np.log1p(-share) + witness, np.log(share)))
+
     def told(self, witness: ArrayLike) -> Array:
-        """By what all views tell a known thing from one of unknown mesh (...), nats, for sums of `witness` (...).
+        """By what all visits tell a known thing from one of unknown mesh (...), nats, for sums of `seen_in_visit`.
 
         It has an end: some things of unknown mesh are taken for known ones as often as those are found
         (`detector.deceived`).
@@ -262,7 +271,7 @@ class Model:
             log_evidence: (C,) of each class at the poses that were found, scores and context included; -inf for none.
             score_evidence: (C,) the scores' part of it; -inf for classes that have no pose.
             log_clutter: log evidence of something that no mesh explains.
-            witness: what all boxes and their absences say for the most probable class, see `witness`.
+            witness: what all boxes and their absences say for the most probable class, see `seen_in_visit`.
             log_rivals: of what else it may be.
 
         Returns:

@@ -69,6 +69,12 @@ class Detector:
         low=1e-9,
         high=0.9,
     )
+    overlooked: float = option(
+        0.02,
+        "share of visits in which a known thing is found as rarely as one of unknown mesh",
+        low=1e-9,
+        high=0.9,
+    )
     confusion: float = option(0.1, "chance that a class is persistently taken for another", low=1e-6, high=0.9)
     score_floor: float = option(0.05, "weight of a uniform belief mixed into score vectors", low=1e-6, high=0.9)
 

@@ -68,7 +68,9 @@ class Belief:
     log_clutter: float
     """log evidence of something that no mesh explains"""
     witness: float
-    """what its boxes and their absences say for a known thing against a look-alike, nats"""
+    """what its boxes and their absences say in this visit for a known thing against a look-alike, nats"""
+    witness_before: float
+    """what those of the visits before say"""
     log_elsewhere: float
     """log evidence of having been moved to where nobody looked"""
     visit: int
@@ -100,6 +102,10 @@ class Belief:
     def explained(self) -> Array:
         """(C,) what depth and boxes say of each class's poses so far; -inf where there are none."""
         return np.array([-np.inf if c is None else c.log_evidence for c in self.classes])
+
+    def witnessed(self, model: Model) -> float:
+        """What boxes and their absences say for a known thing against a look-alike, in all visits, nats."""
+        return self.witness_before + model.seen_in_visit(self.witness)
 
     def called(self, model: Model) -> Array:
         """(C,) log evidence of what the detector has called it, in all visits."""

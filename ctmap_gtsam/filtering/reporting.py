@@ -141,7 +141,7 @@ class Reporter:
         there = float(log_sum(log_evidence + context))
         scores = belief.called(self.model)
         posed = np.where([own is not None for own in belief.classes], scores, -np.inf)
-        rivals = (belief.log_clutter, belief.witness, 0.0, belief.log_elsewhere)
+        rivals = (belief.log_clutter, belief.witnessed(self.model), 0.0, belief.log_elsewhere)
         existence, probability = self.model.existence(log_evidence + context, posed, *rivals)
         # particles are what views of this camera agree on; that the camera itself is elsewhere they can't know
         away_m = float(np.linalg.norm(belief.viewpoint))
@@ -193,7 +193,7 @@ class Reporter:
         lines = [
             Line("class", float(scores[best])),
             Line("clutter", -belief.log_clutter),
-            Line("witness", belief.witness),
+            Line("witness", belief.witnessed(self.model)),
         ]
         if own is None or T is None:
             return tuple(lines)

@@ -128,6 +128,7 @@ class Updater:
             score_evidence=np.zeros(n),
             log_clutter=0.0,
             witness=0.0,
+            witness_before=0.0,
             log_elsewhere=-np.inf,
             visit=observation.frame.visit,
             first_ns=observation.frame.time_ns,
@@ -198,12 +199,12 @@ class Updater:
             classes=weighed,
             log_evidence=belief.class_log_evidence(self.model),
             log_clutter=belief.log_clutter,
-            witness=belief.witness,
+            witness=belief.witnessed(self.model),
         )
         return replace(belief, past=past.joined(stage))
 
     def _enter_visit(self, belief: Belief, observation: Observation) -> Belief:
-        """A new visit: the detector's persistent belief of the last one has said what it had to say."""
+        """A new visit: the detector's persistent belief of the last one has said what it had to say, and its misses."""
         if observation.frame.visit == belief.visit:
             return belief
         return replace(
@@ -211,6 +212,8 @@ class Updater:
             visit=observation.frame.visit,
             score_evidence=belief.called(self.model),
             score_sum=np.zeros_like(belief.score_sum),
+            witness_before=belief.witnessed(self.model),
+            witness=0.0,
         )
 
     def _where(self, belief: Belief, detection: Detection | None, observation: Observation) -> Array | None:

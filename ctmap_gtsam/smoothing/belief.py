@@ -291,11 +291,11 @@ def judge(
     log_evidence = model.between_classes(evidence) + scores - np.log(len(model.shapes))
     posed = np.where(np.isfinite(evidence), scores, -np.inf)
     best = int(np.argmax(log_evidence))
-    witness = _witness(stages[best], posteriors[best], sightings, best) if best in stages else 0.0
+    visits = [recording.visit(k) for k in keyframes]
+    witness = _witness(stages[best], posteriors[best], sightings, best, visits, model) if best in stages else 0.0
     solid, probability = model.existence(log_evidence, posed, clutter, witness, 0.0)
     # objects are what was detected: what has no box of its own left is what others are
     posterior = (solid if boxes else 0.0, probability)
-    visits = [recording.visit(k) for k in keyframes]
     claims = _claims(stages[best], posteriors[best], visits) if best in stages else np.zeros(len(keyframes))
     return Thing(object_id, boxes, sightings, stages, posteriors, log_evidence, scores, posterior, claims)
 
@@ -311,14 +311,21 @@ def _claims(stages: tuple[Stage, ...], posterior: Posterior, visits: Sequence[in
     return np.asarray(np.bincount(stand, weights=said)[stand])
 
 
-def _witness(stages: tuple[Stage, ...], posterior: Posterior, sightings: Mapping[int, Sighting], c: int) -> float:
+def _witness(
+    stages: tuple[Stage, ...],
+    posterior: Posterior,
+    sightings: Mapping[int, Sighting],
+    c: int,
+    visits: Sequence[int],
+    model: Model,
+) -> float:
     """What boxes and their absences say along the best path of a class, where it was measured, nats."""
-    total = 0.0
-    for stage, state in zip(stages, posterior.path, strict=True):
+    by_visit: dict[int, float] = {}
+    for stage, state, visit in zip(stages, posterior.path, visits, strict=True):
         modes = sightings[stage.keyframe].modes[c]
         if modes is not None and state < len(modes):
-            total += float(modes.witness[state])
-    return total
+            by_visit[visit] = by_visit.get(visit, 0.0) + float(modes.witness[state])
+    return sum(model.seen_in_visit(witness) for witness in by_visit.values())
 
 
 def _noise_variance(stages: tuple[Stage, ...], shape: Shape, recording: Recording, model: Model) -> Array:

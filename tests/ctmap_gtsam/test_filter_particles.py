@@ -214,6 +214,27 @@ def test_a_thing_that_was_moved_while_nobody_looked_is_met_as_likely_as_it_lands
     assert said_by(stayed, same, around).moved < 0.01
 
 
+def test_what_the_detector_says_of_a_thing_is_bounded_visit_by_visit():
+    """Missed in all of one visit and found in the next: as `Model.seen_in_visit` weighs each."""
+
+    class Witnessed(GaussianProposer):
+        def witness(self, shape, view, T):
+            return -4.0 if view.k < 4 else 2.0
+
+    model = Model(classes("mug"), config_of(), context=False)
+    updater = Updater(model, Witnessed({}, {}), LocalisationNoise())
+    updater.proposer.measured = dict.fromkeys(range(6), REFERENCE)
+    updater.proposer.covariance = {k: np.diag(SCALE**2) for k in range(6)}
+    detection = Detection((100.0, 80.0, 60.0, 60.0), np.array([0.1, 0.9]))
+    belief = begun(updater, Track(0, (0,), (detection,), 0), observation_at(0, detection, 0.0))
+    for k in range(1, 6):
+        seen = observation_at(k, detection, float(k))
+        seen = replace(seen, frame=replace(seen.frame, visit=int(k >= 4)))
+        belief = updater.step(belief, detection, seen, Surroundings((), ()))
+    assert belief.witnessed(model) == pytest.approx(model.seen_in_visit(-16.0) + model.seen_in_visit(4.0))
+    assert belief.witnessed(model) > np.log(model.config.detector.overlooked)
+
+
 @pytest.mark.parametrize("jump", [1e-12, 0.01])
 def test_no_measurement_takes_a_thing_farther_than_it_can_be_pushed(jump):
     """A box a metre away, with all the depth in the world, is another thing's."""

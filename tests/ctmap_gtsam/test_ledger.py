@@ -149,6 +149,7 @@ def reported(model, shape, T, view, *, around=(), before=None, waited_s=None):
         score_evidence=nothing,
         log_clutter=0.0,
         witness=0.0,
+        witness_before=0.0,
         log_elsewhere=-np.inf,
         visit=0,
         first_ns=0,

@@ -90,6 +90,17 @@ def test_what_the_detector_tells_is_bounded_by_how_often_it_is_deceived():
     assert MODEL.told(-30.0) == pytest.approx(-30.0 - np.log1p(-MODEL.config.detector.deceived), abs=1e-6)
 
 
+@given(st.floats(-500.0, 0.0), st.floats(-500.0, 500.0))
+def test_a_visit_in_which_all_views_miss_a_thing_says_no_more_than_that_it_was_overlooked(less, more):
+    assert MODEL.seen_in_visit(0.0) == pytest.approx(0.0)
+    least = np.log(MODEL.config.detector.overlooked)
+    assert least <= MODEL.seen_in_visit(less) <= 0.0
+    assert MODEL.seen_in_visit(less) <= MODEL.seen_in_visit(max(less, more)) <= max(less, more, 0.0)
+    # found in another visit, it exists all the same
+    witness = MODEL.seen_in_visit(less) + MODEL.seen_in_visit(8.0)
+    assert MODEL.existence(np.array([1e4, 0.0, 0.0]), np.zeros(3), -100.0, witness, -100.0)[0] > 0.95
+
+
 @given(st.floats(0.05, 1.0))
 def test_being_missed_in_view_speaks_for_a_look_alike_and_being_out_of_sight_for_neither(visible):
     unseen, seen = (
