@@ -19,6 +19,7 @@ from factors.measurement import (
     class_log_ratio,
     confusion,
     detected_log_potential,
+    detected_silhouettes,
     persistent_class_log_evidence,
 )
 from factors.persistence import stay_probability
@@ -157,11 +158,14 @@ class Model:
         A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1), but that a box of its
         track's own would then be something else's.
         """
-        boxes = None
-        if detection is not None:
-            rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
-            boxes = self.box(np.array(detection.box), rendered, image_size)
-        return self.kappa * scores.log_ratio + self.detection(_shares(scores), boxes)
+        d = self.config.detector
+        if detection is None:
+            boxes = self.detection(_shares(scores), None)
+        else:
+            seen = scores.covered, scores.visible, scores.box
+            widths = d.box_sigma, image_size, d.box_outlier
+            boxes = detected_silhouettes(detection.box, *seen, *widths, d.detection_probability)
+        return self.kappa * scores.log_ratio + boxes
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
