@@ -73,13 +73,17 @@ class Model:
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
 
     def prediction_covariance(self, dt_s: float) -> Array:
-        """Sigma = Q dt (6, 6) in the centre frame's tangent.
+        """Sigma = Q dt (6, 6) in the centre frame's tangent, of `prediction_variances`."""
+        return prediction.covariance(*self.prediction_variances(dt_s), 1.0)
+
+    def prediction_variances(self, dt_s: float) -> tuple[float, float]:
+        """By how much a thing turns (rad^2) and moves (m^2) along each axis: Q dt.
 
         What stays doesn't wander on while nobody looks: dt counts up to the significant period.
         """
         p = self.config.prediction
         dt_s = min(dt_s, p.significant_period_s)
-        return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
+        return dt_s * p.rotation_rate**2, dt_s * p.translation_rate**2
 
     def stay_probability(self, known: ObjectClass, away_s: float) -> float:
         """Equation 3 for a thing of a class that nobody saw for so many seconds; what can't be moved stays."""
