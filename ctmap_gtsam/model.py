@@ -19,6 +19,7 @@ from factors.measurement import (
     class_log_ratio,
     confusion,
     detected_log_potential,
+    detected_silhouettes,
     persistent_class_log_evidence,
 )
 from factors.persistence import stay_probability
@@ -72,13 +73,17 @@ class Model:
         return confusion(len(self.catalogue), 1.0 - self.config.detector.confusion)
 
     def prediction_covariance(self, dt_s: float) -> Array:
-        """Sigma = Q dt (6, 6) in the centre frame's tangent.
+        """Sigma = Q dt (6, 6) in the centre frame's tangent, of `prediction_variances`."""
+        return prediction.covariance(*self.prediction_variances(dt_s), 1.0)
+
+    def prediction_variances(self, dt_s: float) -> tuple[float, float]:
+        """By how much a thing turns (rad^2) and moves (m^2) along each axis: Q dt.
 
         What stays doesn't wander on while nobody looks: dt counts up to the significant period.
         """
         p = self.config.prediction
         dt_s = min(dt_s, p.significant_period_s)
-        return prediction.covariance(p.rotation_rate**2, p.translation_rate**2, dt_s)
+        return dt_s * p.rotation_rate**2, dt_s * p.translation_rate**2
 
     def stay_probability(self, known: ObjectClass, away_s: float) -> float:
         """Equation 3 for a thing of a class that nobody saw for so many seconds; what can't be moved stays."""
@@ -157,11 +162,14 @@ class Model:
         A hypothesis that covers no pixel of the region is out of view: 0 (the paper's delta = 1), but that a box of its
         track's own would then be something else's.
         """
-        boxes = None
-        if detection is not None:
-            rendered = np.concatenate([scores.box[:, :2], scores.box[:, 2:] - scores.box[:, :2]], axis=-1)
-            boxes = self.box(np.array(detection.box), rendered, image_size)
-        return self.kappa * scores.log_ratio + self.detection(_shares(scores), boxes)
+        d = self.config.detector
+        if detection is None:
+            boxes = self.detection(_shares(scores), None)
+        else:
+            seen = scores.covered, scores.visible, scores.box
+            widths = d.box_sigma, image_size, d.box_outlier
+            boxes = detected_silhouettes(detection.box, *seen, *widths, d.detection_probability)
+        return self.kappa * scores.log_ratio + boxes
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.

@@ -11,9 +11,12 @@ import numba
 import numpy as np
 
 _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
+# an array that is handed on, and a part of one, is counted by an atomic instruction, which takes as long as a sine:
+# what is called for each pair is inlined, and copies entries
+_INLINED = {**_KERNEL, "inline": "always"}
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _quaternion(R, q):
     """[x, y, z, w] up to sign into q (4,), by the best conditioned of Shepperd's four formulas."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -35,7 +38,7 @@ def _quaternion(R, q):
         q[a] /= norm
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _curvature(angle):
     """The coefficient k of W^2 in the inverse left Jacobian I - W/2 + k W^2 of SO(3)."""
     if angle < 1e-2:
@@ -43,7 +46,7 @@ def _curvature(angle):
     return (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _log(T, q, r):
     """The tangent [rotation, translation] of one motion (4, 4) into r (6,). q is (4,) to write into."""
     _quaternion(T, q)
@@ -60,7 +63,7 @@ def _log(T, q, r):
     r[5] = T[2, 3] - 0.5 * c + k * (x * b - y * a)
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _product(A, B, out):
     """A @ B of 3 x 3 matrices, without a call to BLAS, which costs more than the product."""
     for i in range(3):
@@ -129,7 +132,15 @@ def _times_adjoint_inverse(A, B, T, sign, work, out):
         out[3 + i, 2] -= work[i, 0] * y - work[i, 1] * x
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
+def _copy(motions, n, out):
+    """Motion n of (N, 4, 4) into `out` (4, 4)."""
+    for i in range(4):
+        for j in range(4):
+            out[i, j] = motions[n, i, j]
+
+
+@numba.njit(**_INLINED)
 def _relative(T_a, T_b, g, work, out):
     """T_a^-1 T_b g into `out` (4, 4), whose last row is that of a motion already. `work` is (3, 3)."""
     for i in range(3):
@@ -142,7 +153,7 @@ def _relative(T_a, T_b, g, work, out):
         out[i, 3] += work[i, 0] * g[0, 3] + work[i, 1] * g[1, 3] + work[i, 2] * g[2, 3]
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _untwisting(R, free, centre, q, out):
     """The motion about the centre after which R has no part along the free axes (3, f), f = 1 or 3, into `out` (4, 4).
 
@@ -164,27 +175,29 @@ def _untwisting(R, free, centre, q, out):
         out[i, 3] = centre[i] - out[i, 0] * centre[0] - out[i, 1] * centre[1] - out[i, 2] * centre[2]
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**_INLINED)
 def _untwist(R, free, centre, q, U, g, work):
     """g times the motion that `_untwisting` gives, in place. `U` is (4, 4) and `work` (3, 3) to write into."""
     _untwisting(R, free, centre, q, U)
     for i in range(3):
         g[i, 3] += g[i, 0] * U[0, 3] + g[i, 1] * U[1, 3] + g[i, 2] * U[2, 3]
     _product(g, U, work)
-    g[:3, :3] = work
+    for i in range(3):
+        for j in range(3):
+            g[i, j] = work[i, j]
 
 
-@numba.njit(**_KERNEL)
-def _least_turned(T_a, T_b, discrete, free, work, q, M):
+@numba.njit(**_INLINED)
+def _least_turned(T_a, T_b, discrete, free, work, q, g, M):
     """Which discrete symmetry leaves the smallest angle of log(T_a^-1 T_b g), free rotations taken out.
 
     The angle a of a rotation has cos(a / 2) = |w| of its quaternion, and that of its swing sqrt((q . u)^2 + w^2).
+    `work` is (3, 3), `q` (4,), `g` and `M` (4, 4) to write into.
     """
-    if len(discrete) == 1 or free.shape[1] == 3:
-        return 0
     best, chosen = -1.0, 0
-    for s in range(len(discrete)):
-        _relative(T_a, T_b, discrete[s], work, M)
+    for s in range(0 if len(discrete) == 1 or free.shape[1] == 3 else len(discrete)):
+        _copy(discrete, s, g)
+        _relative(T_a, T_b, g, work, M)
         if free.shape[1] == 0:
             score = 2.0 + M[0, 0] + M[1, 1] + M[2, 2]  # 4 w^2, and one
         else:
@@ -211,28 +224,35 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
         chosen: (n,) out, which discrete symmetry.
     """
     work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
-    g, M, U = np.eye(4), np.eye(4), np.eye(4)
+    A, B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4), np.eye(4)
     for n in range(T_a.shape[0]):
+        _copy(T_a, n, A)
+        _copy(T_b, n, B)
         first, last, best = 0, discrete.shape[0], np.inf
         if information.shape[0] == 0:
-            first = _least_turned(T_a[n], T_b[n], discrete, free, work, q, M)
+            first = _least_turned(A, B, discrete, free, work, q, g, M)
             last = first + 1
         for s in range(first, last):
-            g[:] = discrete[s]
-            _relative(T_a[n], T_b[n], g, work, M)
+            _copy(discrete, s, g)
+            _relative(A, B, g, work, M)
             if free.shape[1] > 0:
                 _untwist(M, free, centre, q, U, g, work)
-                _relative(T_a[n], T_b[n], g, work, M)
+                _relative(A, B, g, work, M)
             _log(M, q, r)
             length = 0.0
             if information.shape[0] > 0:
-                L = information[n if information.shape[0] > 1 else 0]
+                metric = n if information.shape[0] > 1 else 0
                 for i in range(6):
                     for j in range(6):
-                        length += r[i] * L[i, j] * r[j]
+                        length += r[i] * information[metric, i, j] * r[j]
             if s == first or length < best:
                 best = length
-                residuals[n], images[n], chosen[n] = r, g, s
+                chosen[n] = s
+                for i in range(6):
+                    residuals[n, i] = r[i]
+                for i in range(4):
+                    for j in range(4):
+                        images[n, i, j] = g[i, j]
 
 
 @numba.njit(**_KERNEL)
@@ -253,7 +273,7 @@ def near(T, others, discrete, free, centre, rotation, translation, out):
         out: (n,) bool.
     """
     work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
-    g, M, U = np.eye(4), np.eye(4), np.eye(4)
+    B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4)
     turns = not (np.any(discrete[:, :3, 3]) or (free.shape[1] > 0 and np.any(centre)))
     farthest = translation * (1.0 + 1e-9)
     for n in range(len(others)):
@@ -261,11 +281,13 @@ def near(T, others, discrete, free, centre, rotation, translation, out):
         if turns and x * x + y * y + z * z > farthest * farthest:
             out[n] = False
             continue
-        g[:] = discrete[_least_turned(T, others[n], discrete, free, work, q, M)]
-        _relative(T, others[n], g, work, M)
+        _copy(others, n, B)
+        s = _least_turned(T, B, discrete, free, work, q, g, M)
+        _copy(discrete, s, g)
+        _relative(T, B, g, work, M)
         if free.shape[1] > 0:
             _untwist(M, free, centre, q, U, g, work)
-            _relative(T, others[n], g, work, M)
+            _relative(T, B, g, work, M)
         _log(M, q, r)
         turned, moved = r[0] ** 2 + r[1] ** 2 + r[2] ** 2, r[3] ** 2 + r[4] ** 2 + r[5] ** 2
         out[n] = math.sqrt(turned) < rotation and math.sqrt(moved) < translation

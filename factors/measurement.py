@@ -342,9 +342,14 @@ def box_log_ratio(
     pairs = np.empty((2, *np.broadcast(found, drawn).shape))
     pairs[0], pairs[1] = found, drawn
     out = np.empty(pairs.shape[1:-1])
-    log_clutter = math.log(4.0) - 2.0 * math.log(image_size[0] * image_size[1])
+    log_clutter = _log_clutter(image_size)
     _box_log_ratios(*pairs.reshape(2, -1, 4), float(sigma_rel), log_clutter, float(outlier), out.reshape(-1))
     return out
+
+
+def _log_clutter(image_size: tuple[float, float]) -> float:
+    """The log of u, the density of a false alarm's box."""
+    return math.log(4.0) - 2.0 * math.log(image_size[0] * image_size[1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -355,26 +360,48 @@ def _log_add(a, b):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _box_ratio(found, drawn, sigma_rel, log_clutter, outlier):
+    """`box_log_ratio` of two boxes, (x, y, w, h) each."""
+    log_outlier = math.log(outlier)
+    if not (drawn[2] > 0.0 and drawn[3] > 0.0):
+        return log_outlier
+    log_density = 0.0
+    for axis in range(2):
+        scale = max(sigma_rel * drawn[2 + axis], 1.0) / math.sqrt(2.0)
+        low = abs(found[axis] - drawn[axis])
+        high = abs(found[axis] + found[2 + axis] - drawn[axis] - drawn[2 + axis])
+        log_density += -2.0 * math.log(2.0 * scale) - (low + high) / scale
+    return _log_add(math.log1p(-outlier) + log_density - log_clutter, log_outlier)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _box_log_ratios(found, drawn, sigma_rel, log_clutter, outlier, out):
-    log_matched, log_outlier = math.log1p(-outlier), math.log(outlier)
     for n in range(len(out)):
-        if not (drawn[n, 2] > 0.0 and drawn[n, 3] > 0.0):
-            out[n] = log_outlier
-            continue
-        log_density = 0.0
-        for axis in range(2):
-            scale = max(sigma_rel * drawn[n, 2 + axis], 1.0) / math.sqrt(2.0)
-            low = abs(found[n, axis] - drawn[n, axis])
-            high = abs(found[n, axis] + found[n, 2 + axis] - drawn[n, axis] - drawn[n, 2 + axis])
-            log_density += -2.0 * math.log(2.0 * scale) - (low + high) / scale
-        out[n] = _log_add(log_matched + log_density - log_clutter, log_outlier)
+        a = found[n, 0], found[n, 1], found[n, 2], found[n, 3]
+        b = drawn[n, 0], drawn[n, 1], drawn[n, 2], drawn[n, 3]
+        out[n] = _box_ratio(a, b, sigma_rel, log_clutter, outlier)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _found(visible, fit, p_found, outlier):
+    """`detected_log_potential` of one hypothesis."""
+    seen = p_found * visible
+    return _log_add(math.log(outlier) + math.log1p(-seen), math.log(seen) + fit)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _detected(visible, fits, p_found, outlier, out):
     for n in range(len(out)):
-        seen = p_found * visible[n]
-        out[n] = _log_add(math.log(outlier) + math.log1p(-seen), math.log(seen) + fits[n])
+        out[n] = _found(visible[n], fits[n], p_found, outlier)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _detected_silhouettes(found, covered, visible, corners, sigma_rel, log_clutter, outlier, p_found, out):
+    for n in range(len(out)):
+        x, y = corners[n, 0], corners[n, 1]
+        drawn = x, y, corners[n, 2] - x, corners[n, 3] - y
+        share = visible[n] / covered[n] if covered[n] > 0.0 else 0.0
+        out[n] = _found(share, _box_ratio(found, drawn, sigma_rel, log_clutter, outlier), p_found, outlier)
 
 
 def detected_log_potential(visible: ArrayLike, fits: ArrayLike, p_found: float, outlier: float) -> Array:
@@ -391,6 +418,34 @@ def detected_log_potential(visible: ArrayLike, fits: ArrayLike, p_found: float, 
     shares, ratios = np.ascontiguousarray(visible, np.float64), np.ascontiguousarray(fits, np.float64)
     out = np.empty(len(shares))
     _detected(shares, ratios, p_found, outlier, out)
+    return out
+
+
+def detected_silhouettes(
+    box_detected: tuple[float, float, float, float],
+    covered: Array,
+    visible: Array,
+    corners: Array,
+    sigma_rel: float,
+    image_size: tuple[float, float],
+    outlier: float,
+    p_found: float,
+) -> Array:
+    """`detected_log_potential` (K,) of silhouettes by their `box_log_ratio`, nats: both in one pass.
+
+    Args:
+        box_detected: x, y, w, h, pixels.
+        covered: (K,) samples of each silhouette.
+        visible: (K,) of those, samples that are seen.
+        corners: (K, 4) x0, y0, x1, y1 of what is seen, pixels; NaN where nothing is.
+        sigma_rel: of a detector's edges, relative to the box.
+        image_size: width, height in pixels.
+        outlier: o, the share of a track's boxes that have nothing to do with their thing.
+        p_found: p_D, how often what is seen whole is found.
+    """
+    out = np.empty(len(covered))
+    u = _log_clutter(image_size)
+    _detected_silhouettes(box_detected, covered, visible, corners, sigma_rel, u, outlier, p_found, out)
     return out
 
 

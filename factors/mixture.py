@@ -52,10 +52,11 @@ def log_sum(log_values: ArrayLike, axis: int = -1) -> Array:
 def normalised(log_weights: ArrayLike, axis: int = -1) -> Array:
     """Log weights shifted so that they sum to one along an axis; uniform where every one is -inf."""
     values = np.asarray(log_weights, dtype=np.float64)
-    total = np.expand_dims(log_sum(values, axis), axis)
-    dead = np.isneginf(total)
-    shifted = values - np.where(dead, 0.0, total)
-    return np.where(dead, -np.log(values.shape[axis]), shifted)
+    total = np.logaddexp.reduce(values, axis=axis, keepdims=True)
+    dead = total == -np.inf
+    if not dead.any():
+        return np.asarray(values - total)
+    return np.where(dead, -np.log(values.shape[axis]), values - np.where(dead, 0.0, total))
 
 
 def mode_log_densities(residuals: ArrayLike, informations: ArrayLike, log_weights: ArrayLike) -> Array:

@@ -68,6 +68,11 @@ class Particles:
         """Effective sample size, 1 to M."""
         return float(1.0 / np.exp(2.0 * self.log_weight).sum())
 
+    @property
+    def heaviest(self) -> Array:
+        """The heaviest pose (4, 4)."""
+        return self.T_world_centre[int(np.argmax(self.log_weight))]
+
     def best(self, n: int) -> Array:
         """The n heaviest poses (n, 4, 4)."""
         return self.T_world_centre[np.argsort(-self.log_weight, kind="stable")[:n]]
@@ -272,9 +277,15 @@ def sufficient(particles: Particles, most: int, shape: Shape) -> int:
     if any(stretches(mode.covariance, shape) for mode in _modes(particles, shape, 1)):
         return _STRETCHED * most
     rows = np.unique(systematic(particles.log_weight, most, 0.5))
-    away = symmetry.residual(particles.best(1)[0], particles.T_world_centre[rows], shape.symmetry)
-    cells = np.unique(np.round(away / np.repeat(_CELL, 3)).astype(np.int64), axis=0)
-    return int(np.clip(kld_bound(len(cells)), round(_LEAST_SHARE * most), most))
+    away = symmetry.residual(particles.heaviest, particles.T_world_centre[rows], shape.symmetry)
+    cells = occupied(np.round(away / np.repeat(_CELL, 3)))
+    return int(np.clip(kld_bound(cells), round(_LEAST_SHARE * most), most))
+
+
+def occupied(cells: Array) -> int:
+    """How many different rows cells (n, d) have."""
+    ordered = cells[np.lexsort(cells.T)]
+    return 1 + int(np.count_nonzero((ordered[1:] != ordered[:-1]).any(axis=1)))
 
 
 def stretches(covariance: Array, shape: Shape) -> bool:
@@ -294,11 +305,11 @@ def first_count(proposals: Gaussians, most: int, shape: Shape) -> int:
 def predicted_spread(model: Model, localisation: LocalisationNoise, dt_s: float, away_m: float) -> Spread:
     """Sigma = Q dt, and by how much localisation may have gone off in between, at a distance from the camera."""
     dt = max(dt_s, 1e-3)
-    walked = np.diag(model.prediction_covariance(dt))
+    walked_round, walked = model.prediction_variances(dt)
     # two recorded poses that lie closer than the correlation time err together
     apart = 2.0 * (1.0 - np.exp(-dt / max(localisation.correlation_time_s, 1e-9)))
     turned, moved = localisation_variance(localisation, away_m)
-    return Spread(float(np.sqrt(walked[0] + apart * turned)), float(np.sqrt(walked[3] + apart * moved)))
+    return Spread(float(np.sqrt(walked_round + apart * turned)), float(np.sqrt(walked + apart * moved)))
 
 
 def kld_bound(cells: int) -> int:
@@ -343,33 +354,33 @@ def _modes(particles: Particles, shape: Shape, most: int) -> Iterator[_Mode]:
         rows = free & (np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0])
         rows &= np.linalg.norm(r[:, 3:], axis=-1) < MODE_RADIUS[1]
         rows[heaviest] = True
-        T, covariance = _moments(poses[heaviest], poses[rows], left[rows], S)
+        T, covariance = _moments(poses[heaviest], poses[rows], r[rows], left[rows], S)
         for _ in range(_GROWTHS):
             variances, axes = np.linalg.eigh(covariance / np.outer(_RADII, _RADII))
             if variances[-1] <= _EDGE**-2:
                 break
-            r = symmetry.residual(T, poses, S) / _RADII
-            within = ((r @ axes) ** 2 / np.maximum(variances, _EDGE**-2)).sum(axis=-1) < _EDGE**2
+            r = symmetry.residual(T, poses, S)
+            within = ((r / _RADII @ axes) ** 2 / np.maximum(variances, _EDGE**-2)).sum(axis=-1) < _EDGE**2
             grown = rows | (free & within)
             if grown.sum() == rows.sum():
                 break
             rows = grown
-            T, covariance = _moments(T, poses[rows], left[rows], S)
+            T, covariance = _moments(T, poses[rows], r[rows], left[rows], S)
         yield _Mode(rows, T, covariance)
         left[rows] = -np.inf
 
 
-def _moments(T: Array, poses: Array, log_weight: Array, S: symmetry.Symmetry) -> tuple[Array, Array]:
+def _moments(T: Array, poses: Array, r: Array, log_weight: Array, S: symmetry.Symmetry) -> tuple[Array, Array]:
     """Mean (4, 4) and covariance (6, 6) of weighted poses (n, 4, 4), each taken in its image nearest to the mean.
 
     Args:
         T: (4, 4) where the mean is looked for.
         poses: (n, 4, 4).
+        r: (n, 6) their residuals from there.
         log_weight: (n,) of any scale.
         S: the symmetries.
     """
     weights = np.exp(mixture.normalised(log_weight))
-    r = symmetry.residual(T, poses, S)
     for _ in range(_MEANS):
         step = weights @ r
         T = retract(T, step)

@@ -235,7 +235,7 @@ class Updater:
         own = belief.classes[best]
         if own is None:
             return None
-        T = observation.frame.T_camera_world @ own.particles.best(1)[0]
+        T = observation.frame.T_camera_world @ own.particles.heaviest
         seen = outlook(self.model.shapes[best], T, observation.frame.camera)
         return seen.box if seen.share > 0.0 and (seen.box[2:] >= 2.0).all() else None
 
@@ -243,7 +243,7 @@ class Updater:
         """From the object to the camera, (3,) metres, world frame."""
         own = belief.classes[int(np.argmax(belief.class_log_evidence(self.model)))]
         camera = observation.frame.T_world_camera[:3, 3]
-        return camera if own is None else camera - own.particles.best(1)[0, :3, 3]
+        return camera if own is None else camera - own.particles.heaviest[:3, 3]
 
     def _allow_move(self, belief: Belief, observation: Observation) -> Belief:
         """After a significant absence the object stayed with S(dt) (Equation 3), or was moved.
@@ -325,7 +325,7 @@ class Updater:
         own = belief.classes[best]
         if own is None:
             return None
-        return _Standard(own.log_evidence, self._remembered(belief, self.model.shapes[best], own.particles.best(1)[0]))
+        return _Standard(own.log_evidence, self._remembered(belief, self.model.shapes[best], own.particles.heaviest))
 
     def _remembered(self, belief: Belief, shape: Shape, T_world_centre: Array) -> float:
         away = float(np.linalg.norm(belief.viewpoint))
@@ -388,7 +388,7 @@ class Updater:
             rng: draws particles around the new pose.
         """
         T = found.T_world_centre[0]
-        if own is not None and symmetry.near(own.particles.best(1)[0], T, shape.symmetry, *MODE_RADIUS):
+        if own is not None and symmetry.near(own.particles.heaviest, T, shape.symmetry, *MODE_RADIUS):
             return own
         mode = Gaussians(found.T_world_centre[:1], found.covariance[:1], np.zeros(1))
         remembered = self._remembered(belief, shape, T)
@@ -469,7 +469,7 @@ class Updater:
 
     def _nearby(self, particles: Particles, T_world_centre: Array) -> NDArray[np.bool_]:
         """Which poses (K, 4, 4) a push can bring about; a box farther away is another thing's."""
-        away = np.linalg.norm(T_world_centre[:, :3, 3] - particles.best(1)[0, :3, 3], axis=-1)
+        away = np.linalg.norm(T_world_centre[:, :3, 3] - particles.heaviest[:3, 3], axis=-1)
         return np.asarray(away < self.model.config.prediction.region_radius_m)
 
     def _in_world(self, modes: PoseModes, observation: Observation) -> Gaussians | None:
@@ -488,7 +488,7 @@ class Updater:
         own = belief.classes[best]
         if own is None:
             return belief
-        shape, T = self.model.shapes[best], observation.frame.T_camera_world @ own.particles.best(1)[0]
+        shape, T = self.model.shapes[best], observation.frame.T_camera_world @ own.particles.heaviest
         return replace(
             belief,
             log_clutter=belief.log_clutter + self.proposer.log_clutter(shape, view, T, first=belief.steps == 1),

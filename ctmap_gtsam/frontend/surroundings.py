@@ -99,7 +99,9 @@ class Surroundings:
         """The context potential of poses (K, 4, 4), nats (K,): once for a stationary episode. 0 without context."""
         if not model.context or not len(T_world_centre):
             return np.zeros(len(T_world_centre))
-        together = self._relations(model, shape, T_world_centre) + self._penetration(model, shape, T_world_centre)
+        apart = self._apart(T_world_centre)
+        together = self._relations(model, shape, T_world_centre, apart)
+        together += self._penetration(model, shape, T_world_centre, apart)
         return together + support_log_potential(model, shape, T_world_centre, self.supports)
 
     def relations(self, model: Model, shape: Shape, T_world_centre: Array) -> dict[int, float]:
@@ -118,13 +120,16 @@ class Surroundings:
                 out[other.object_id] = float(said - greatest)
         return out
 
-    def _relations(self, model: Model, shape: Shape, T: Array) -> Array:
-        total = np.zeros(len(T))
-        for other in self.neighbours:
-            distance = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
-            related = model.relations[shape.index, other.shape.index]
-            total += context_log_ratio(distance, related, self._instance(shape, T, other))
-        return total
+    def _apart(self, T_world_centre: Array) -> Array:
+        """Distances (N, K) of N neighbours' centres from poses (K, 4, 4), metres."""
+        centres = np.array([n.T_world_centre[:3, 3] for n in self.neighbours]).reshape(-1, 1, 3)
+        return np.asarray(np.linalg.norm(T_world_centre[:, :3, 3] - centres, axis=-1))
+
+    def _relations(self, model: Model, shape: Shape, T: Array, apart: Array) -> Array:
+        classes = np.array([[other.shape.index] for other in self.neighbours], dtype=np.int64).reshape(-1, 1)
+        instance = np.array([self._instance(shape, T, other) for other in self.neighbours]).reshape(apart.shape)
+        related = model.relations[shape.index, classes]
+        return np.asarray(context_log_ratio(apart, related, instance).sum(axis=0))
 
     def _instance(self, shape: Shape, T: Array, other: Neighbour) -> Array:
         """What earlier visits, or other ones, say of a pair; 0 but for the one that was moved together."""
@@ -136,12 +141,11 @@ class Surroundings:
         own = self.partner
         return own if own is not None and own.concerns(other.object_id, (shape.index, other.shape.index)) else None
 
-    def _penetration(self, model: Model, shape: Shape, T: Array) -> Array:
+    def _penetration(self, model: Model, shape: Shape, T: Array, apart: Array) -> Array:
         settings = model.config.context
         total = np.zeros(len(T))
-        for other in self.neighbours:
-            apart = np.linalg.norm(T[:, :3, 3] - other.T_world_centre[:3, 3], axis=-1)
-            near = np.flatnonzero(apart < shape.reach_m + other.shape.reach_m)
+        for other, away in zip(self.neighbours, apart, strict=True):
+            near = np.flatnonzero(away < shape.reach_m + other.shape.reach_m)
             if len(near):
                 depth = penetration_depth(shape, other.shape, se3.inverse(T[near]) @ other.T_world_centre)
                 sinking = hinge_log_potential(depth - settings.support_tolerance_m, settings.penetration_sigma_m)

@@ -12,6 +12,7 @@ from ctmap_gtsam.filtering.particles import (
     Particles,
     Spread,
     kld_bound,
+    occupied,
     predict,
     predicted_log_density,
     sufficient,
@@ -106,7 +107,14 @@ def test_the_heaviest_come_first_and_ties_in_order():
     T[:, 0, 3] = np.arange(4)
     particles = Particles(T, np.log([0.2, 0.3, 0.3, 0.2]))
     np.testing.assert_array_equal(particles.best(4)[:, 0, 3], [1, 2, 0, 3])
+    np.testing.assert_array_equal(particles.heaviest, particles.best(1)[0])
     assert Particles(T, np.full(4, np.log(0.25))).effective == pytest.approx(4.0)
+
+
+@given(st.integers(0, 2**31), st.integers(1, 60))
+def test_occupied_cells_are_different_rows(seed, n):
+    cells = np.round(np.random.default_rng(seed).normal(scale=0.6, size=(n, 3)))
+    assert occupied(cells) == len(np.unique(cells, axis=0))
 
 
 @pytest.mark.parametrize("share", [0.5, 0.01], ids=["half proposed", "almost all predicted"])

@@ -49,6 +49,7 @@ def test_news_of_a_view_lies_between_none_and_all(seed):
 def test_prediction_is_a_rate():
     one, two = MODEL.prediction_covariance(0.5), MODEL.prediction_covariance(1.5)
     np.testing.assert_allclose(one + two, MODEL.prediction_covariance(2.0))
+    np.testing.assert_array_equal(np.diag(one), np.repeat(MODEL.prediction_variances(0.5), 3))
 
 
 def says(score, n_classes=5, own=1, background=0.05):

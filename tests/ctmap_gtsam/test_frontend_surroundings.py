@@ -136,6 +136,15 @@ def test_moving_the_whole_world_changes_nothing(seed):
     np.testing.assert_allclose(turned.log_potential(MODEL, MUG, poses), expected, atol=1e-12)
 
 
+@settings(max_examples=15)
+@given(st.integers(0, 2**31))
+def test_neighbours_say_together_what_each_says_alone(seed):
+    others = (neighbour(1, BOX, 0.05, 0.03), neighbour(2, CAN, -0.1), neighbour(3, MUG, 0.3))
+    alone = [Surroundings((n,), ()).log_potential(MODEL, CAN, poses_near(seed)) for n in others]
+    together = Surroundings(others, ()).log_potential(MODEL, CAN, poses_near(seed))
+    np.testing.assert_allclose(together, np.sum(alone, axis=0), atol=1e-12)
+
+
 def test_two_things_in_one_place_are_impossible_and_side_by_side_they_are_not():
     inside, beside = standing(MUG, 0.02), standing(MUG, 0.2)
     around = Surroundings((neighbour(1, BOX),), ())

@@ -143,6 +143,23 @@ def test_a_tracks_box_is_its_things_or_has_nothing_to_do_with_it(seed, found, ou
     )
 
 
+@given(SEEDS, st.floats(0.01, 0.999), st.floats(1e-6, 0.5))
+def test_silhouettes_are_judged_in_one_pass_as_by_their_boxes_and_shares(seed, found, outlier):
+    rng = np.random.default_rng(seed)
+    covered = rng.integers(0, 50, size=20).astype(np.float64)
+    visible = np.floor(covered * rng.random(20))
+    corners = np.where(visible[:, None] > 0, rng.uniform(0, 300, (20, 4)), np.nan)
+    corners[:, 2:] += corners[:, :2]
+    box, image = (30.0, 40.0, 100.0, 80.0), (640, 480)
+    drawn = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=-1)
+    fits = measurement.box_log_ratio(box, drawn, 0.05, image, outlier)
+    shares = np.divide(visible, covered, out=np.zeros(20), where=covered > 0)
+    np.testing.assert_array_equal(
+        measurement.detected_silhouettes(box, covered, visible, corners, 0.05, image, outlier, found),
+        measurement.detected_log_potential(shares, fits, found, outlier),
+    )
+
+
 def test_the_box_density_integrates_to_one_an_edge():
     """Along one edge: the density of a box whose left edge moves, times that of the three that stay."""
     drawn, image = np.array([100.0, 80, 60, 40]), (640, 480)
