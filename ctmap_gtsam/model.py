@@ -19,7 +19,6 @@ from factors.measurement import (
     class_log_ratio,
     confusion,
     detected_log_potential,
-    detected_silhouettes,
     persistent_class_log_evidence,
 )
 from factors.persistence import stay_probability
@@ -164,12 +163,12 @@ class Model:
         """
         d = self.config.detector
         if detection is None:
-            boxes = self.detection(_shares(scores), None)
+            found = np.log1p(-d.detection_probability * _shares(scores))
         else:
             seen = scores.covered, scores.visible, scores.box
             widths = d.box_sigma, image_size, d.box_outlier
-            boxes = detected_silhouettes(detection.box, *seen, *widths, d.detection_probability)
-        return self.kappa * scores.log_ratio + boxes
+            found = detected_log_potential(detection.box, *seen, *widths, d.detection_probability)
+        return self.kappa * scores.log_ratio + found
 
     def box(self, detected: Array, rendered: Array, image_size: tuple[int, int]) -> Array:
         """(K,) log ratio of a detected box (4,) for rendered boxes (K, 4), both x, y, w, h in pixels.
@@ -178,13 +177,6 @@ class Model:
         """
         d = self.config.detector
         return box_log_ratio(detected, rendered, d.box_sigma, image_size, d.box_outlier)
-
-    def detection(self, visible: Array, box_log_ratios: Array | None) -> Array:
-        """log of the detection potential (K,) for visible shares (K,): with its track's box (K,), or missed (None)."""
-        d = self.config.detector
-        if box_log_ratios is None:
-            return np.log1p(-d.detection_probability * visible)
-        return detected_log_potential(visible, box_log_ratios, d.detection_probability, d.box_outlier)
 
     def class_scores(self, detection: Detection) -> Array:
         """(C,) log p(s | d) / p(s | clutter) of a score vector for each class d that the detector may believe in."""

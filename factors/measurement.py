@@ -384,19 +384,13 @@ def _box_log_ratios(found, drawn, sigma_rel, log_clutter, outlier, out):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _found(visible, fit, p_found, outlier):
-    """`detected_log_potential` of one hypothesis."""
+    """The log of o (1 - p_D v) + p_D v l / u."""
     seen = p_found * visible
     return _log_add(math.log(outlier) + math.log1p(-seen), math.log(seen) + fit)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _detected(visible, fits, p_found, outlier, out):
-    for n in range(len(out)):
-        out[n] = _found(visible[n], fits[n], p_found, outlier)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _detected_silhouettes(found, covered, visible, corners, sigma_rel, log_clutter, outlier, p_found, out):
+def _detected(found, covered, visible, corners, sigma_rel, log_clutter, outlier, p_found, out):
     for n in range(len(out)):
         x, y = corners[n, 0], corners[n, 1]
         drawn = x, y, corners[n, 2] - x, corners[n, 3] - y
@@ -404,24 +398,7 @@ def _detected_silhouettes(found, covered, visible, corners, sigma_rel, log_clutt
         out[n] = _found(share, _box_ratio(found, drawn, sigma_rel, log_clutter, outlier), p_found, outlier)
 
 
-def detected_log_potential(visible: ArrayLike, fits: ArrayLike, p_found: float, outlier: float) -> Array:
-    """The log of o (1 - p_D v) + p_D v l / u, (K,) nats: of a track's own box in a view.
-
-    That it came from elsewhere is as rare for what hides as for what shows.
-
-    Args:
-        visible: (K,) v, the share of each silhouette that is seen.
-        fits: (K,) log l / u, of `box_log_ratio`.
-        p_found: p_D, how often what is seen whole is found.
-        outlier: o, the share of a track's boxes that have nothing to do with their thing.
-    """
-    shares, ratios = np.ascontiguousarray(visible, np.float64), np.ascontiguousarray(fits, np.float64)
-    out = np.empty(len(shares))
-    _detected(shares, ratios, p_found, outlier, out)
-    return out
-
-
-def detected_silhouettes(
+def detected_log_potential(
     box_detected: tuple[float, float, float, float],
     covered: Array,
     visible: Array,
@@ -431,7 +408,10 @@ def detected_silhouettes(
     outlier: float,
     p_found: float,
 ) -> Array:
-    """`detected_log_potential` (K,) of silhouettes by their `box_log_ratio`, nats: both in one pass.
+    """The log of o (1 - p_D v) + p_D v l / u, (K,) nats: of a track's own box in a view.
+
+    v is the share of a silhouette that is seen, and l / u the `box_log_ratio` of its box. That the track's box came
+    from elsewhere is as rare for what hides as for what shows.
 
     Args:
         box_detected: x, y, w, h, pixels.
@@ -445,7 +425,7 @@ def detected_silhouettes(
     """
     out = np.empty(len(covered))
     u = _log_clutter(image_size)
-    _detected_silhouettes(box_detected, covered, visible, corners, sigma_rel, u, outlier, p_found, out)
+    _detected(box_detected, covered, visible, corners, sigma_rel, u, outlier, p_found, out)
     return out
 
 

@@ -97,15 +97,6 @@ def test_out_of_view_is_no_evidence_but_for_a_box_of_its_own():
         assert proposer.score(shape, view, far)[0][0] == pytest.approx(nats, abs=1e-12)
 
 
-def test_a_missed_detection_costs_what_the_visible_share_makes_of_it():
-    p = MODEL.config.detector.detection_probability
-    shares = np.linspace(0.0, 1.0, 5)
-    said = MODEL.detection(shares, None)
-    assert said[0] == 0.0
-    assert said[-1] == pytest.approx(np.log1p(-p))
-    assert (np.diff(said) < 0).all()
-
-
 def test_a_box_far_off_costs_no_more_than_one_that_has_nothing_to_do_with_it():
     detected = np.array([50.0, 50.0, 40.0, 40.0])
     shifts = np.array([[d, 0.0, 0.0, 0.0] for d in (0, 2, 5, 20, 100, 250)])

@@ -12,7 +12,7 @@ from ctmap_gtsam.config import Config
 from ctmap_gtsam.frontend.scoring import Scores
 from ctmap_gtsam.parameters import Sensor
 from sequences import se3
-from sequences.types import LocalisationNoise
+from sequences.types import Detection, LocalisationNoise
 from tests.ctmap_gtsam.scenes import model_of
 
 MODEL = model_of("mug", "soup_can", "cereal_box")
@@ -135,17 +135,30 @@ def test_a_surfaces_error_turns_a_small_thing_more_than_a_large_one_and_moves_it
         np.testing.assert_allclose(moved**2 - sensor.bias_translation_m**2, (sensor.bias_size * shape.radius_m) ** 2)
 
 
-@given(st.floats(-20.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_a_box_of_its_own_does_not_speak_for_what_hides(fit, some, more):
+def said_of_a_box(shift, visible, found=True):
+    """log phi_m of a silhouette of 100 samples at 10, 10 of which some are seen, and a box so many pixels beside it."""
+    scores = Scores(np.zeros(1), np.full(1, 100.0), np.full(1, visible), np.array([[10.0, 10.0, 50.0, 60.0]]))
+    box = Detection((10.0 + shift, 10.0, 40.0, 50.0), np.array([0.1, 0.3, 0.3, 0.3]))
+    return float(MODEL.log_likelihood(scores, box if found else None, (320, 240))[0])
+
+
+@given(st.floats(0.0, 200.0), st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+def test_a_box_of_its_own_does_not_speak_for_what_hides(shift, some, more):
     """A track's box came from elsewhere as rarely when its thing is hidden as when it shows."""
-    outlier = MODEL.config.detector.box_outlier
-    hidden, seen = (float(MODEL.detection(np.array([v]), np.array([fit]))[0]) for v in (0.0, more))
-    assert hidden == pytest.approx(np.log(outlier))
-    assert min(np.log(outlier), fit) - 0.11 <= seen <= max(np.log(outlier), fit) + 1e-9
-    less, no_less = (MODEL.detection(np.array([v]), np.array([fit]))[0] for v in sorted((some, more)))
-    assert (no_less >= less - 1e-9) == (fit >= np.log(outlier) - 1e-9) or less == pytest.approx(no_less)
+    outlier = np.log(MODEL.config.detector.box_outlier)
+    fit = float(MODEL.box(np.array([10.0 + shift, 10, 40, 50]), np.array([[10.0, 10, 40, 50]]), (320, 240))[0])
+    assert said_of_a_box(shift, 0.0) == pytest.approx(outlier)
+    assert min(outlier, fit) - 0.11 <= said_of_a_box(shift, more) <= max(outlier, fit) + 1e-9
+    less, no_less = (said_of_a_box(shift, visible) for visible in sorted((some, more)))
+    assert (no_less >= less - 1e-9) == (fit >= outlier - 1e-9) or less == pytest.approx(no_less)
     # and without a box being hidden says nothing
-    assert MODEL.detection(np.array([0.0]), None)[0] == 0.0
+    assert said_of_a_box(shift, 0.0, found=False) == 0.0
+
+
+def test_a_missed_detection_costs_what_the_visible_share_makes_of_it():
+    said = [said_of_a_box(0.0, visible, found=False) for visible in np.linspace(0.0, 100.0, 5)]
+    assert said[-1] == pytest.approx(np.log1p(-MODEL.config.detector.detection_probability))
+    assert (np.diff(said) < 0).all()
 
 
 SHARE = MODEL.config.sensor.mesh_share
