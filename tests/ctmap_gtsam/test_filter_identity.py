@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief
+from ctmap_gtsam.filtering.belief import ClassBelief
 from ctmap_gtsam.filtering.identity import as_moved, at_place, moved_to, twin
 from ctmap_gtsam.filtering.particles import Particles
 from ctmap_gtsam.filtering.reporting import Reported
 from sequences import se3
+from tests.ctmap_gtsam.beliefs import belief_of
 from tests.ctmap_gtsam.scenes import model_of
 
 MODEL = model_of("mug", "soup_can")
@@ -93,10 +94,7 @@ def test_what_cannot_be_moved_is_not_found_elsewhere():
 def believed(object_id, evidence):
     particles = Particles(np.eye(4)[None], np.zeros(1))
     classes = tuple(ClassBelief(particles, float(nats)) for nats in evidence)
-    nothing = np.zeros(len(classes))
-    return Belief(
-        object_id, classes, nothing, nothing, 0.0, 0.0, -np.inf, 0, 10 * object_id, 0, 0, np.ones(3), True, 1, None
-    )  # fmt: skip
+    return belief_of(classes, object_id=object_id, first_ns=10 * object_id)
 
 
 @given(st.floats(0.0, 1.0), st.floats(-50.0, 50.0))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctmap_gtsam.estimate import Estimate
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief, Glimpse
+from ctmap_gtsam.filtering.belief import ClassBelief, Glimpse
 from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.particles import Particles
 from ctmap_gtsam.filtering.reporting import Reporter
@@ -20,6 +20,7 @@ from ctmap_gtsam.smoothing.smoother import smooth_run
 from sequences import se3
 from sequences.bop import load_run
 from sequences.types import LocalisationNoise
+from tests.ctmap_gtsam.beliefs import belief_of
 from tests.ctmap_gtsam.scenes import CHEAP, config_of, looking, model_of, shape_named, small_run, standing, view_of
 
 QUICK = (*CHEAP, "frontend.start_after=2", "frontend.angular_step_rad=0.01", "frontend.mesh_faces=200")
@@ -138,28 +139,11 @@ def test_a_lag_writes_each_keyframes_factors_once():
 def reported(model, shape, T, view, *, around=(), before=None, waited_s=None):
     """What the filter says of an object whose particles are all at one pose."""
     reporter = Reporter(model, Proposer(model), LocalisationNoise())
-    nothing = np.zeros(len(model.shapes))
     own = ClassBelief(Particles(T[None], np.zeros(1)), 100.0)
     classes = tuple(own if s is shape else None for s in model.shapes)
     camera, observation, tile = view
-    belief = Belief(
-        object_id=1,
-        classes=classes,
-        score_sum=nothing,
-        score_evidence=nothing,
-        log_clutter=0.0,
-        witness=0.0,
-        witness_before=0.0,
-        log_elsewhere=-np.inf,
-        visit=0,
-        first_ns=0,
-        present_ns=0,
-        time_ns=0,
-        viewpoint=camera[:3, 3] - T[:3, 3],
-        visible=True,
-        steps=1,
-        glimpse=Glimpse(tile, observation.frame.T_camera_world, waited_s),
-    )
+    glimpse = Glimpse(tile, observation.frame.T_camera_world, waited_s)
+    belief = belief_of(classes, object_id=1, viewpoint=camera[:3, 3] - T[:3, 3], glimpse=glimpse)
     said = reporter.report(belief, Surroundings(tuple(around), ()), before)
     return said, {(line.potential, line.other): line.nats for line in said.ledger}
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctmap_gtsam.filtering.belief import Belief, ClassBelief
+from ctmap_gtsam.filtering.belief import ClassBelief
 from ctmap_gtsam.filtering.particles import Particles
 from ctmap_gtsam.frontend.proposer import PoseModes
 from ctmap_gtsam.smoothing.belief import judge
@@ -14,6 +14,7 @@ from ctmap_gtsam.smoothing.rounds import wanted_of
 from factors.symmetry import near
 from sequences import se3
 from sequences.types import Detection
+from tests.ctmap_gtsam.beliefs import belief_of
 from tests.ctmap_gtsam.scenes import model_of
 from tests.ctmap_gtsam.things import EMPTY, HERE, MODEL, RECORDING, SEEN, THERE, stays, thing
 
@@ -83,9 +84,7 @@ def test_between_classes_that_explain_as_much_but_for_their_meshes_error_the_det
     particles = Particles(HERE[None], np.zeros(1))
     classes = tuple(ClassBelief(particles, float(nats)) for nats in explained)
     scores = np.sum([model.class_scores(box) for box in boxes.values()], axis=0)
-    filtered = Belief(
-        0, classes, scores, np.zeros(2), 0.0, 0.0, -np.inf, 0, 0, 0, 0, np.ones(3), True, 8, None
-    )  # fmt: skip
+    filtered = belief_of(classes, score_sum=scores, steps=8)
     assert (np.argmax(filtered.class_log_evidence(model)) == 1) == named
 
 
