@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from ctmap_gtsam.estimate import Estimate
 from ctmap_gtsam.evaluation.matching import Matching, MethodMap, ObjectFrames
-from ctmap_gtsam.evaluation.statistics import log_score, mean
+from ctmap_gtsam.evaluation.statistics import log_score, mean, median
 from ctmap_gtsam.evaluation.visits import ends, last_frames
 from factors.symmetry import Symmetry, nearest_image, residual
 from sequences import se3
@@ -36,9 +36,11 @@ Bools = NDArray[np.bool_]
 
 LEVELS = {"coverage_50": 0.5, "coverage_80": 0.8, "coverage_95": 0.95}
 
-POSE_CALIBRATION = (*LEVELS, "anees")
+POSE_CALIBRATION = (*LEVELS, "anees", "position_error_mm_median", "position_sigma_mm_median")
 """coverage_*: share of the true poses in the region that should hold so many. anees: average NEES over degrees of
-freedom, 1 for a calibrated method, more for one that is too sure"""
+freedom, 1 for a calibrated method, more for one that is too sure. position_*: the usual error, and the usual root mean
+square error that the reported pose's own covariance claims; of one Gaussian, the same in all directions, the median
+error is 0.89 of it"""
 
 EXISTENCE = ("existence_log_score", "existence_brier_score")
 """Logarithmic and squared error of P(exists); lower is better"""
@@ -56,6 +58,10 @@ class PoseSamples:
     """(n,) degrees of freedom, 3 to 6"""
     mass: Array
     """(n,) of the belief, what is more probable than the truth: uniform on 0 to 1 if calibrated"""
+    error_m: Array
+    """(n,) of the reported position"""
+    sigma_m: Array
+    """(n,) root of the trace of its covariance, of the reported mode alone"""
 
 
 @dataclass(frozen=True)
@@ -78,11 +84,9 @@ def pose_samples(run: Run, method: MethodMap, truth: Truth, objects: ObjectFrame
         if row >= 0 and method.objects.class_id[row, final[v]] == thing.obj_id:
             T_true = thing.T_world_object[np.searchsorted(thing.frames, there[n, v])]
             rows.append(_sample(method.estimate, int(row), int(method.held[final[v]]), T_true, run.catalogue))
-    rows = [r for r in rows if r[1] > 0]
+    columns = np.array([r for r in rows if r[1] > 0], dtype=np.float64).reshape(-1, 5).T
     return PoseSamples(
-        nees=np.array([r[0] for r in rows], dtype=np.float64),
-        freedom=np.array([r[1] for r in rows], dtype=np.int64),
-        mass=np.array([r[2] for r in rows], dtype=np.float64),
+        nees=columns[0], freedom=columns[1].astype(np.int64), mass=columns[2], error_m=columns[3], sigma_m=columns[4]
     )
 
 
@@ -160,7 +164,12 @@ def pose_calibration_metrics(samples: PoseSamples) -> dict[str, float | None]:
     some = len(samples.nees) > 0
     inside = {name: samples.mass <= level for name, level in LEVELS.items()}
     anees = float(samples.nees.sum() / samples.freedom.sum()) if some else np.inf
-    return {**{name: mean(share) for name, share in inside.items()}, "anees": anees if np.isfinite(anees) else None}
+    return {
+        **{name: mean(share) for name, share in inside.items()},
+        "anees": anees if np.isfinite(anees) else None,
+        "position_error_mm_median": median(1e3 * samples.error_m),
+        "position_sigma_mm_median": median(1e3 * samples.sigma_m),
+    }
 
 
 def existence_metrics(samples: ExistenceSamples) -> dict[str, float | None]:
@@ -172,15 +181,17 @@ def existence_metrics(samples: ExistenceSamples) -> dict[str, float | None]:
     }
 
 
-def _sample(estimate: Estimate, row: int, k: int, T_true: Array, catalogue: Catalogue) -> tuple[float, int, float]:
-    """NEES, degrees of freedom and `denser_mass`."""
+def _sample(estimate: Estimate, row: int, k: int, T_true: Array, catalogue: Catalogue) -> tuple[float, ...]:
+    """NEES, degrees of freedom, `denser_mass`, and the position's error and standard deviation, metres."""
     m, best = estimate.modes, int(estimate.best_mode[row, k])
     rows = np.flatnonzero((m.object == row) & (m.keyframe == k) & (m.class_id == m.class_id[best]))
     symmetry = Symmetry.of(catalogue[int(m.class_id[best])])
     belief = m.log_weight[rows], m.T_world_object[rows], m.covariance[rows]
     covariance = spread_about(int(np.flatnonzero(rows == best)[0]), *belief, symmetry)
     error, freedom = nees(m.T_world_object[best], covariance, m.free_axes[best], T_true, symmetry)
-    return error, freedom, denser_mass(*belief, m.free_axes[rows], T_true, symmetry)
+    mass = denser_mass(*belief, m.free_axes[rows], T_true, symmetry)
+    off = residual(m.T_world_object[best], T_true, symmetry)[3:]
+    return error, freedom, mass, float(np.linalg.norm(off)), float(np.sqrt(np.trace(m.covariance[best][3:, 3:])))
 
 
 def _held(free_axes: Array, symmetry: Symmetry) -> Array:

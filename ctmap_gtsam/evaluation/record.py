@@ -46,7 +46,7 @@ from sequences.types import Run, Truth
 
 Array = NDArray[np.float64]
 
-SCHEMA = 4
+SCHEMA = 5
 
 DETECTOR = "detector"
 """Name of the method that is the recorded boxes, which have no poses"""

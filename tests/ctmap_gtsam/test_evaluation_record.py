@@ -43,6 +43,7 @@ ONES = (
 ZEROS = (
     *("mssd_mm_median", "adds_mm_median", "add_mm_median", "translation_mm_median", "rotation_deg_median"),
     *("ate_mm", "ate_deg", "rpe_mm", "rpe_deg", "class_log_score", "class_brier_score", "anees"),
+    "position_error_mm_median",
     *("existence_log_score", "existence_brier_score", "false_moves", "moves_log_score"),
     *("missed_objects", "false_positive_objects", "identity_switches"),
 )
@@ -444,9 +445,12 @@ def test_coverage_by_hand(small):
     found = judged(run, truth, synthetic.estimate_of(run, truth, disturb=synthetic.shifted(0.003)))
     assert [found[f"coverage_{level}"] for level in (50, 80, 95)] == [0, 0, 1]
     assert found["anees"] == pytest.approx(9 / 6)
+    assert found["position_error_mm_median"] == pytest.approx(3.0)
+    assert found["position_sigma_mm_median"] == pytest.approx(np.sqrt(3.0))
     wrong = judged(run, truth, synthetic.estimate_of(run, truth, class_of=lambda n, f: 9))
     assert wrong["anees"] is None
     assert wrong["coverage_95"] is None
+    assert wrong["position_sigma_mm_median"] is None
 
 
 HALF_TURN = se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
