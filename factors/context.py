@@ -247,8 +247,7 @@ def hinge_residual(excess_m: ArrayLike, sigma_m: ArrayLike) -> tuple[Array, Arra
 
 def hinge_log_potential(excess_m: ArrayLike, sigma_m: ArrayLike) -> Array:
     """-1/2 (max(0, excess) / sigma)^2 (...) nats, of a penetration depth or a gap to the support, metres."""
-    excess, sigma = np.asarray(excess_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64)
-    return np.asarray(-0.5 * (np.maximum(excess, 0.0) / sigma) ** 2)
+    return -0.5 * hinge_residual(excess_m, sigma_m)[0] ** 2
 
 
 def doubted(log_potential: ArrayLike, doubt: float) -> Array:

@@ -143,7 +143,6 @@ class Proposer:
         self.model = model
         self.settings = model.config.frontend
         self.hypotheses_scored = 0
-        self._falling: dict[int, Array] = {}
         self._fine = np.full(self.settings.refinement_steps - self._coarse_steps, self.settings.refinement_widths_m[1])
 
     @property
@@ -152,11 +151,8 @@ class Proposer:
 
     def _coarse(self, shape: Shape) -> Array:
         """Falling widths; furniture is drawn from further away than a mug, by its size."""
-        if shape.index not in self._falling:
-            first, last = self.settings.refinement_widths_m
-            first *= max(1.0, shape.reach_m / _SMALL_REACH_M)
-            self._falling[shape.index] = np.geomspace(first, last, self._coarse_steps)
-        return self._falling[shape.index]
+        first, last = self.settings.refinement_widths_m
+        return np.geomspace(first * max(1.0, shape.reach_m / _SMALL_REACH_M), last, self._coarse_steps)
 
     def view(
         self,
