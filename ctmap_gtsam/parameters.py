@@ -61,7 +61,7 @@ class Detector:
         high=0.9,
     )
     lookalike: float = option(
-        0.1, "chance that what a known mesh explains is something else of its shape", low=1e-9, high=0.5
+        0.1, "odds that what a known mesh explains is something else of its shape", low=1e-9, high=1e3
     )
     deceived: float = option(
         0.2,
@@ -154,7 +154,7 @@ class Filter:
     proposal_share: float = option(
         0.5, "particles drawn around refined modes rather than from the prediction", low=0.01, high=0.95
     )
-    search_every: int = option(5, "keyframes between fresh searches", low=1)
+    search_every: int = option(5, "keyframes between fresh searches at least; they grow with an object's age", low=1)
     search_share: float = option(0.25, "effort of such a search, as a share of the first one's", low=0.0, high=1.0)
     trajectories: int = option(300, "a class and object drawn back through the particles, for ffbsi-ct", low=10)
 

@@ -88,6 +88,8 @@ class Belief:
     glimpse: Glimpse
     searched: int = 1
     """steps when it was last searched for"""
+    returned: int = 1
+    """steps when its last absence ended; the first where there was none"""
     memory: Memory = field(default_factory=Memory)
     past: Past | None = None
     """for the backward pass; None where nobody goes back"""

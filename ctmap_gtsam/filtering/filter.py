@@ -155,8 +155,7 @@ class Forward:
         belief = self.beliefs[i]
         if not self.hand.updater.sees(belief, detection, observation):
             return 0.0
-        due = detection is not None and belief.steps - belief.searched >= self.model.config.filter.search_every
-        return (1.0 + self.scored.last(i)) * (_SEARCH if due else 1.0)
+        return (1.0 + self.scored.last(i)) * (_SEARCH if self.hand.updater.searches(belief, detection) else 1.0)
 
     def _count(self, objects: Sequence[int], done: Sequence[Done[Any]]) -> None:
         """Take down what was scored for objects."""

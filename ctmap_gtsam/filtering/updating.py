@@ -162,7 +162,7 @@ class Updater:
         waited = (observation.frame.time_ns - belief.time_ns) * 1e-9
         share = self.model.view_share(belief.viewpoint, viewpoint, waited)
         view = self.proposer.view(observation, box, detection, around, share)
-        search = view.detection is not None and belief.steps - belief.searched >= self.model.config.filter.search_every
+        search = self.searches(belief, detection)
         classes = self._step_classes(belief, view, observation, around, search)
         scores = belief.score_sum if detection is None else belief.score_sum + self.model.class_scores(detection)
         moved = replace(
@@ -224,6 +224,15 @@ class Updater:
         """Whether an object is in view at a keyframe, so that a step has something to do."""
         return detection is not None or self._outline(belief, observation) is not None
 
+    def searches(self, belief: Belief, detection: Detection | None) -> bool:
+        """Whether a fresh search is due: after as many views again as there were until the last, and never too soon.
+
+        What was not found in twenty views is seldom found in the next five. Ages are counted from the end of the last
+        absence, when a thing may stand anyhow again.
+        """
+        again = max(self.model.config.filter.search_every, belief.searched - belief.returned)
+        return detection is not None and belief.steps - belief.searched >= again
+
     def covers(self, belief: Belief, detection: Detection, observation: Observation) -> bool:
         """Whether a box overlaps at all with where the object would appear."""
         outline = self._outline(belief, observation)
@@ -270,6 +279,7 @@ class Updater:
             classes=classes,
             log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)),
             absence=Absence(poses, log_odds, belief.time_ns, observation.frame.time_ns),
+            returned=belief.steps,
         )
 
     def _moved_odds(self, belief: Belief, shape: Shape, observation: Observation) -> float:

@@ -76,7 +76,7 @@ def mug_lost(model):
     lost = ClassBelief(Particles(np.tile(far_off, (24, 1, 1)), np.full(24, -np.log(24.0))), -200.0)
     classes = tuple(lost if c == MUG.index else own for c, own in enumerate(belief.classes))
     # a class so far behind sleeps most of the time
-    return updater, replace(belief, classes=classes, steps=14, searched=13)
+    return updater, replace(belief, classes=classes, steps=14, searched=13, returned=14)
 
 
 def after(updater, belief, score):
@@ -98,6 +98,26 @@ def test_a_class_that_was_not_found_at_first_is_believed_once_it_is():
     assert np.argmax(belief.class_log_evidence(MODEL)) == MUG.index
     own = belief.classes[MUG.index]
     assert np.linalg.norm(own.particles.best(1)[0, :3, 3] - TRUTH[:3, 3]) < 0.01
+
+
+def test_searches_are_ever_further_apart_until_an_absence_ends():
+    updater = Updater(MODEL, Proposer(MODEL), LocalisationNoise())
+    belief, first = mug_lost(MODEL)[1], seen(0)
+    every = MODEL.config.filter.search_every
+
+    def ages(returned, views):
+        """Views since then at which it is searched for; all have boxes."""
+        now, out = replace(belief, steps=returned, searched=returned, returned=returned), []
+        for _ in range(views):
+            now = replace(now, steps=now.steps + 1)
+            if updater.searches(now, first.frame.detections[0]):
+                out.append(now.steps - returned)
+                now = replace(now, searched=now.steps)
+        return out
+
+    assert ages(1, 40 * every) == [every * 2**n for n in range(6)]
+    assert ages(77, 40 * every) == ages(1, 40 * every)
+    assert not updater.searches(replace(belief, steps=10**6), None)
 
 
 def test_what_the_detector_names_is_searched_for_without_waiting_and_what_it_does_not_is_not():
