@@ -10,6 +10,8 @@ import math
 import numba
 import numpy as np
 
+from factors.motions import compiled_retract
+
 _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
 # an array that is handed on, and a part of one, is counted by an atomic instruction, which takes as long as a sine:
 # what is called for each pair is inlined, and copies entries
@@ -208,6 +210,17 @@ def _least_turned(T_a, T_b, discrete, free, work, q, g, M):
     return chosen
 
 
+@numba.njit(**_INLINED)
+def _least(T_a, T_b, discrete, free, centre, work, q, g, M, U, r):
+    """The log(T_a^-1 T_b g) of the smallest angle into r (6,). The others from `work` on are as in `_untwist`."""
+    _copy(discrete, _least_turned(T_a, T_b, discrete, free, work, q, g, M), g)
+    _relative(T_a, T_b, g, work, M)
+    if free.shape[1] > 0:
+        _untwist(M, free, centre, q, U, g, work)
+        _relative(T_a, T_b, g, work, M)
+    _log(M, q, r)
+
+
 @numba.njit(**_KERNEL)
 def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, chosen):
     """The shortest log(T_a^-1 T_b g) of each of n pairs over the symmetries g.
@@ -282,13 +295,7 @@ def near(T, others, discrete, free, centre, rotation, translation, out):
             out[n] = False
             continue
         _copy(others, n, B)
-        s = _least_turned(T, B, discrete, free, work, q, g, M)
-        _copy(discrete, s, g)
-        _relative(T, B, g, work, M)
-        if free.shape[1] > 0:
-            _untwist(M, free, centre, q, U, g, work)
-            _relative(T, B, g, work, M)
-        _log(M, q, r)
+        _least(T, B, discrete, free, centre, work, q, g, M, U, r)
         turned, moved = r[0] ** 2 + r[1] ** 2 + r[2] ** 2, r[3] ** 2 + r[4] ** 2 + r[5] ** 2
         out[n] = math.sqrt(turned) < rotation and math.sqrt(moved) < translation
 
@@ -313,6 +320,46 @@ def distinct(poses, order, most, discrete, free, centre, rotation, translation, 
                 remaining += 1
         rest = remaining
     return number
+
+
+@numba.njit(**_KERNEL)
+def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, covariance):
+    """Mean and covariance of weighted poses, each in its image nearest to the mean, by fixed-point steps.
+
+    Args:
+        T: (4, 4) where the mean is looked for; out, the mean.
+        poses: (n, 4, 4).
+        weights: (n,) of sum 1.
+        discrete: (S, 4, 4).
+        free: (3, f) free axes through the centre.
+        centre: (3,).
+        steps: at most.
+        still: rad or metres, a step that residuals need not follow.
+        residuals: (n, 6) the shortest from T to the poses; out, from the mean.
+        covariance: (6, 6) out, of the mean's right tangent.
+    """
+    work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
+    B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4)
+    step, moved = np.empty((1, 6)), np.empty((1, 4, 4))
+    for _ in range(steps):
+        step[:] = 0.0
+        for n in range(len(poses)):
+            for i in range(6):
+                step[0, i] += weights[n] * residuals[n, i]
+        compiled_retract(T.reshape(1, 4, 4), step, moved)
+        _copy(moved, 0, T)
+        if np.abs(step).max() < still:
+            break
+        for n in range(len(poses)):
+            _copy(poses, n, B)
+            _least(T, B, discrete, free, centre, work, q, g, M, U, r)
+            for i in range(6):
+                residuals[n, i] = r[i]
+    covariance[:] = 0.0
+    for n in range(len(poses)):
+        for i in range(6):
+            for j in range(6):
+                covariance[i, j] += weights[n] * residuals[n, i] * residuals[n, j]
 
 
 @numba.njit(**_KERNEL)

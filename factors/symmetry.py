@@ -25,15 +25,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors._shortest import distinct as compiled_distinct
+from factors._shortest import moments as compiled_moments
 from factors._shortest import near as compiled_near
 from factors._shortest import shortest, shortest_jacobians
-from factors.mixture import LOG_2PI, LOG_ROTATIONS
+from factors.mixture import LOG_2PI, LOG_ROTATIONS, normalised
 from factors.motions import filled
 from sequences import se3
 from sequences.catalogue import ObjectClass
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+_STILL = 1e-9  # a step of the mean, rad or metres, that residuals need not follow
 
 
 def _axis_turns() -> Array:
@@ -195,6 +198,27 @@ def distinct(
     group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
     number = compiled_distinct(T, order, most, *group, rotation_rad, translation_m, kept)
     return [int(row) for row in kept[:number]]
+
+
+def moments(
+    T: ArrayLike, poses: ArrayLike, log_weights: ArrayLike, symmetry: Symmetry, residuals: Array, steps: int
+) -> tuple[Array, Array]:
+    """Mean (4, 4) and covariance (6, 6) of weighted poses, each taken in its image nearest to the mean.
+
+    Args:
+        T: (4, 4) where the mean is looked for.
+        poses: (n, 4, 4).
+        log_weights: (n,) of any scale.
+        symmetry: of the object.
+        residuals: (n, 6) `residual` of the poses from T; afterwards from the mean, to within `_STILL`.
+        steps: towards the mean, at most; what lies within a turn needs fewer than five.
+    """
+    mean, covariance = np.array(T, dtype=np.float64), np.empty((6, 6))
+    group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
+    weights = np.exp(normalised(log_weights))
+    near_poses = np.ascontiguousarray(poses, dtype=np.float64)
+    compiled_moments(mean, near_poses, weights, *group, steps, _STILL, residuals, covariance)
+    return mean, covariance
 
 
 def residual_jacobians(
