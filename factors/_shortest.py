@@ -334,7 +334,7 @@ def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, 
         free: (3, f) free axes through the centre.
         centre: (3,).
         steps: at most.
-        still: rad or metres, a step that residuals need not follow.
+        still: rad or metres, a step that none need follow.
         residuals: (n, 6) the shortest from T to the poses; out, from the mean.
         covariance: (6, 6) out, of the mean's right tangent.
     """
@@ -348,13 +348,13 @@ def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, 
                 step[0, i] += weights[n] * residuals[n, i]
         compiled_retract(T.reshape(1, 4, 4), step, moved)
         _copy(moved, 0, T)
-        if np.abs(step).max() < still:
-            break
         for n in range(len(poses)):
             _copy(poses, n, B)
             _least(T, B, discrete, free, centre, work, q, g, M, U, r)
             for i in range(6):
                 residuals[n, i] = r[i]
+        if np.abs(step).max() < still:
+            break
     covariance[:] = 0.0
     for n in range(len(poses)):
         for i in range(6):

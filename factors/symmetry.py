@@ -36,7 +36,7 @@ from sequences.catalogue import ObjectClass
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_STILL = 1e-9  # a step of the mean, rad or metres, that residuals need not follow
+_STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
 
 
 def _axis_turns() -> Array:
@@ -210,7 +210,7 @@ def moments(
         poses: (n, 4, 4).
         log_weights: (n,) of any scale.
         symmetry: of the object.
-        residuals: (n, 6) `residual` of the poses from T; afterwards from the mean, to within `_STILL`.
+        residuals: (n, 6) `residual` of the poses from T; afterwards from the mean.
         steps: towards the mean, at most; what lies within a turn needs fewer than five.
     """
     mean, covariance = np.array(T, dtype=np.float64), np.empty((6, 6))
