@@ -171,28 +171,43 @@ def _steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Arr
 def _log_sums(a, b, log_weight, images, out):
     """log of the sum over rows k of a (M, D) and over each query's images of exp(log_weight_k - |b - a_k|^2 / 2).
 
-    `b` is (K images, D), the images of a query next to each other; `out` is (K,).
+    `b` is (K images, D), D a multiple of three, the images of a query next to each other; `out` is (K,).
     """
-    columns, exponents = np.ascontiguousarray(a.T), np.empty(images * len(a))
+    n, columns = len(a), np.ascontiguousarray(a.T)
+    exponents = np.empty(images * n)
     for query in range(len(out)):
         for i in range(images):
-            # a feature at a time for all rows, which is vectorised
-            squared = exponents[i * len(a) : (i + 1) * len(a)]
+            # three features at a time for all rows, which is vectorised
+            squared, row = exponents[i * n : (i + 1) * n], query * images + i
             squared[:] = 0.0
-            for d in range(len(columns)):
-                at, column = b[query * images + i, d], columns[d]
-                for k in range(len(a)):
-                    squared[k] += (at - column[k]) ** 2
-            for k in range(len(a)):
+            for d in range(0, len(columns), 3):
+                x, y, z = b[row, d], b[row, d + 1], b[row, d + 2]
+                xs, ys, zs = columns[d], columns[d + 1], columns[d + 2]
+                for k in range(n):
+                    squared[k] = squared[k] + (x - xs[k]) ** 2 + (y - ys[k]) ** 2 + (z - zs[k]) ** 2
+            for k in range(n):
                 squared[k] = log_weight[k] - 0.5 * squared[k]
-        largest = -np.inf
-        for exponent in exponents:
-            largest = max(largest, exponent)
+        largest = _largest(exponents)
         total, least = 0.0, largest - _NOTHING
         for exponent in exponents:
             if exponent > least:
                 total += math.exp(exponent - largest)
         out[query] = largest + math.log(total) if total > 0.0 else -np.inf
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _largest(values):
+    """Of values (n,), by four at a time: each comparison waits for the one before."""
+    a = b = c = d = -np.inf
+    whole = len(values) // 4 * 4
+    for k in range(0, whole, 4):
+        a = values[k] if values[k] > a else a
+        b = values[k + 1] if values[k + 1] > b else b
+        c = values[k + 2] if values[k + 2] > c else c
+        d = values[k + 3] if values[k + 3] > d else d
+    for k in range(whole, len(values)):
+        a = values[k] if values[k] > a else a
+    return max(max(a, b), max(c, d))
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
