@@ -210,23 +210,12 @@ def _least_turned(T_a, T_b, discrete, free, work, q, g, M):
     return chosen
 
 
-@numba.njit(**_INLINED)
-def _least(T_a, T_b, discrete, free, centre, work, q, g, M, U, r):
-    """The log(T_a^-1 T_b g) of the smallest angle into r (6,). The others from `work` on are as in `_untwist`."""
-    _copy(discrete, _least_turned(T_a, T_b, discrete, free, work, q, g, M), g)
-    _relative(T_a, T_b, g, work, M)
-    if free.shape[1] > 0:
-        _untwist(M, free, centre, q, U, g, work)
-        _relative(T_a, T_b, g, work, M)
-    _log(M, q, r)
-
-
 @numba.njit(**_KERNEL)
 def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, chosen):
     """The shortest log(T_a^-1 T_b g) of each of n pairs over the symmetries g.
 
     Args:
-        T_a: (n, 4, 4).
+        T_a: (n, 4, 4) or one (1, 4, 4).
         T_b: (n, 4, 4).
         discrete: (S, 4, 4).
         free: (3, f) free axes through the centre.
@@ -238,8 +227,9 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
     """
     work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
     A, B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4), np.eye(4)
-    for n in range(T_a.shape[0]):
-        _copy(T_a, n, A)
+    for n in range(T_b.shape[0]):
+        if n < T_a.shape[0]:
+            _copy(T_a, n, A)
         _copy(T_b, n, B)
         first, last, best = 0, discrete.shape[0], np.inf
         if information.shape[0] == 0:
@@ -295,7 +285,13 @@ def near(T, others, discrete, free, centre, rotation, translation, out):
             out[n] = False
             continue
         _copy(others, n, B)
-        _least(T, B, discrete, free, centre, work, q, g, M, U, r)
+        s = _least_turned(T, B, discrete, free, work, q, g, M)
+        _copy(discrete, s, g)
+        _relative(T, B, g, work, M)
+        if free.shape[1] > 0:
+            _untwist(M, free, centre, q, U, g, work)
+            _relative(T, B, g, work, M)
+        _log(M, q, r)
         turned, moved = r[0] ** 2 + r[1] ** 2 + r[2] ** 2, r[3] ** 2 + r[4] ** 2 + r[5] ** 2
         out[n] = math.sqrt(turned) < rotation and math.sqrt(moved) < translation
 
@@ -327,7 +323,7 @@ def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, 
     """Mean and covariance of weighted poses, each in its image nearest to the mean, by fixed-point steps.
 
     Args:
-        T: (4, 4) where the mean is looked for; out, the mean.
+        T: (1, 4, 4) where the mean is looked for; out, the mean.
         poses: (n, 4, 4).
         weights: (n,) of sum 1.
         discrete: (S, 4, 4).
@@ -338,21 +334,16 @@ def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, 
         residuals: (n, 6) the shortest from T to the poses; out, from the mean.
         covariance: (6, 6) out, of the mean's right tangent.
     """
-    work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
-    B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4)
-    step, moved = np.empty((1, 6)), np.empty((1, 4, 4))
+    step, moved, angle = np.empty((1, 6)), np.empty((1, 4, 4)), np.empty((0, 6, 6))
+    images, chosen = np.empty(poses.shape), np.empty(len(poses), np.int64)
     for _ in range(steps):
         step[:] = 0.0
         for n in range(len(poses)):
             for i in range(6):
                 step[0, i] += weights[n] * residuals[n, i]
-        compiled_retract(T.reshape(1, 4, 4), step, moved)
-        _copy(moved, 0, T)
-        for n in range(len(poses)):
-            _copy(poses, n, B)
-            _least(T, B, discrete, free, centre, work, q, g, M, U, r)
-            for i in range(6):
-                residuals[n, i] = r[i]
+        compiled_retract(T, step, moved)
+        T[:] = moved
+        shortest(T, poses, discrete, free, centre, angle, residuals, images, chosen)
         if np.abs(step).max() < still:
             break
     covariance[:] = 0.0

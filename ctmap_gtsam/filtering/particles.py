@@ -207,7 +207,7 @@ def _largest(values):
         d = values[k + 3] if values[k + 3] > d else d
     for k in range(whole, len(values)):
         a = values[k] if values[k] > a else a
-    return max(max(a, b), max(c, d))
+    return max(a, b, c, d)
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
