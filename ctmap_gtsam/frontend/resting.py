@@ -49,7 +49,7 @@ def resting_poses(
     yaw = _yaws(R_camera_level, R_level_centre, shape, planes, uniforms[:, 1])
     R = R_camera_level @ _turns(yaw) @ R_level_centre
     surface = np.minimum((uniforms[:, 2] * len(surfaces)).astype(int), len(surfaces) - 1)
-    height = -((up @ R) @ shape.hull_points.T).min(axis=-1)
+    height = -(shape.hull_points @ (up @ R)[..., None])[..., 0].min(axis=-1)
     offset = np.array([s.offset for s in surfaces])[surface]
     normal = np.stack([s.normal for s in surfaces])[surface]
     with np.errstate(divide="ignore"):
@@ -134,9 +134,4 @@ def _yaws(R_camera_level: Array, R_level_centre: Array, shape: Shape, planes: tu
 
 def _turns(yaw: Array) -> Array:
     """(n, 3, 3) about z."""
-    R = np.zeros((len(yaw), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
-    R[:, 1, 0] = np.sin(yaw)
-    R[:, 0, 1] = -R[:, 1, 0]
-    R[:, 2, 2] = 1.0
-    return R
+    return se3.so3_exp(yaw[:, None] * np.array([0.0, 0.0, 1.0]))
