@@ -10,6 +10,8 @@ import math
 import numba
 import numpy as np
 
+from factors.motions import compiled_retract
+
 _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
 # an array that is handed on, and a part of one, is counted by an atomic instruction, which takes as long as a sine:
 # what is called for each pair is inlined, and copies entries
@@ -213,7 +215,7 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
     """The shortest log(T_a^-1 T_b g) of each of n pairs over the symmetries g.
 
     Args:
-        T_a: (n, 4, 4).
+        T_a: (n, 4, 4) or one (1, 4, 4).
         T_b: (n, 4, 4).
         discrete: (S, 4, 4).
         free: (3, f) free axes through the centre.
@@ -225,8 +227,9 @@ def shortest(T_a, T_b, discrete, free, centre, information, residuals, images, c
     """
     work, q, r = np.empty((3, 3)), np.empty(4), np.empty(6)
     A, B, g, M, U = np.eye(4), np.eye(4), np.eye(4), np.eye(4), np.eye(4)
-    for n in range(T_a.shape[0]):
-        _copy(T_a, n, A)
+    for n in range(T_b.shape[0]):
+        if n < T_a.shape[0]:
+            _copy(T_a, n, A)
         _copy(T_b, n, B)
         first, last, best = 0, discrete.shape[0], np.inf
         if information.shape[0] == 0:
@@ -313,6 +316,41 @@ def distinct(poses, order, most, discrete, free, centre, rotation, translation, 
                 remaining += 1
         rest = remaining
     return number
+
+
+@numba.njit(**_KERNEL)
+def moments(T, poses, weights, discrete, free, centre, steps, still, residuals, covariance):
+    """Mean and covariance of weighted poses, each in its image nearest to the mean, by fixed-point steps.
+
+    Args:
+        T: (1, 4, 4) where the mean is looked for; out, the mean.
+        poses: (n, 4, 4).
+        weights: (n,) of sum 1.
+        discrete: (S, 4, 4).
+        free: (3, f) free axes through the centre.
+        centre: (3,).
+        steps: at most.
+        still: rad or metres, a step that none need follow.
+        residuals: (n, 6) the shortest from T to the poses; out, from the mean.
+        covariance: (6, 6) out, of the mean's right tangent.
+    """
+    step, moved, angle = np.empty((1, 6)), np.empty((1, 4, 4)), np.empty((0, 6, 6))
+    images, chosen = np.empty(poses.shape), np.empty(len(poses), np.int64)
+    for _ in range(steps):
+        step[:] = 0.0
+        for n in range(len(poses)):
+            for i in range(6):
+                step[0, i] += weights[n] * residuals[n, i]
+        compiled_retract(T, step, moved)
+        T[:] = moved
+        shortest(T, poses, discrete, free, centre, angle, residuals, images, chosen)
+        if np.abs(step).max() < still:
+            break
+    covariance[:] = 0.0
+    for n in range(len(poses)):
+        for i in range(6):
+            for j in range(6):
+                covariance[i, j] += weights[n] * residuals[n, i] * residuals[n, j]
 
 
 @numba.njit(**_KERNEL)

@@ -241,7 +241,7 @@ def hinge_residual(excess_m: ArrayLike, sigma_m: ArrayLike) -> tuple[Array, Arra
 
     The excess is how deep two objects intersect, or how high one floats above what carries it; below 0 all is well.
     """
-    excess, sigma = np.broadcast_arrays(np.asarray(excess_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64))
+    excess, sigma = np.asarray(excess_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64)
     return np.maximum(excess, 0.0) / sigma, np.where(excess > 0.0, 1.0 / sigma, 0.0)
 
 

@@ -18,7 +18,7 @@ _SMALL_RAD = 1e-4  # below it the series is exact to the last bit
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _retract(T, xi, out):
+def compiled_retract(T, xi, out):
     """T exp(xi) of n motions (n, 4, 4) or one (1, 4, 4), and tangents (n, 6), into `out` (n, 4, 4).
 
     With the rotation vector w = a u, exp(w) = I + s W + k W^2 and V = I + k W + m W^2 (Barfoot, 7.15 and 7.86).
@@ -61,7 +61,7 @@ def retract(T: ArrayLike, xi: ArrayLike) -> Array:
     if poses.size != 16 and poses.shape[:-2] != batch:
         poses = filled(poses, (*batch, 4, 4))
     out = np.empty((*batch, 4, 4))
-    _retract(
+    compiled_retract(
         np.ascontiguousarray(poses).reshape(-1, 4, 4),
         np.ascontiguousarray(tangents).reshape(-1, 6),
         out.reshape(-1, 4, 4),

@@ -25,15 +25,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors._shortest import distinct as compiled_distinct
+from factors._shortest import moments as compiled_moments
 from factors._shortest import near as compiled_near
 from factors._shortest import shortest, shortest_jacobians
-from factors.mixture import LOG_2PI, LOG_ROTATIONS
+from factors.mixture import LOG_2PI, LOG_ROTATIONS, normalised
 from factors.motions import filled
 from sequences import se3
 from sequences.catalogue import ObjectClass
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+_STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
 
 
 def _axis_turns() -> Array:
@@ -173,7 +176,10 @@ def residual(T_a: ArrayLike, T_b: ArrayLike, symmetry: Symmetry = NONE, informat
     Returns:
         (..., 6) in the object's tangent. Free directions carry nothing: see `Symmetry.projection`.
     """
-    return _shortest(*_pairs(T_a, T_b), symmetry, information)[0]
+    A, B = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
+    # one pose for all need not be repeated
+    pairs = (np.ascontiguousarray(A), np.ascontiguousarray(B)) if A.ndim == 2 else _pairs(A, B)
+    return _shortest(*pairs, symmetry, information)[0]
 
 
 def near(
@@ -195,6 +201,27 @@ def distinct(
     group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
     number = compiled_distinct(T, order, most, *group, rotation_rad, translation_m, kept)
     return [int(row) for row in kept[:number]]
+
+
+def moments(
+    T: ArrayLike, poses: ArrayLike, log_weights: ArrayLike, symmetry: Symmetry, residuals: Array, steps: int
+) -> tuple[Array, Array]:
+    """Mean (4, 4) and covariance (6, 6) of weighted poses, each taken in its image nearest to the mean.
+
+    Args:
+        T: (4, 4) where the mean is looked for.
+        poses: (n, 4, 4).
+        log_weights: (n,) of any scale.
+        symmetry: of the object.
+        residuals: (n, 6) `residual` of the poses from T; afterwards from the mean.
+        steps: towards the mean, at most; what lies within a turn needs fewer than five.
+    """
+    mean, covariance = np.array(T, dtype=np.float64)[None], np.empty((6, 6))
+    group = symmetry.discrete, symmetry.free_rotations, symmetry.centre
+    weights = np.exp(normalised(log_weights))
+    near_poses = np.ascontiguousarray(poses, dtype=np.float64)
+    compiled_moments(mean, near_poses, weights, *group, steps, _STILL, residuals, covariance)
+    return mean[0], covariance
 
 
 def residual_jacobians(
@@ -267,8 +294,15 @@ def _flat(T: Array) -> Array:
 
 
 def _shortest(A: Array, B: Array, symmetry: Symmetry, information: ArrayLike | None) -> tuple[Array, Array, Ints]:
-    """The residual (..., 6), the g (..., 4, 4) that gives it, and which discrete one (...) it holds."""
-    batch = A.shape[:-2]
+    """The residual (..., 6), the g (..., 4, 4) that gives it, and which discrete one (...) it holds.
+
+    Args:
+        A: (..., 4, 4), or one pose (4, 4).
+        B: (..., 4, 4).
+        symmetry: of the object.
+        information: as in `residual`.
+    """
+    batch = B.shape[:-2]
     metric = np.empty((0, 6, 6))
     if information is not None:
         metric = np.asarray(information, dtype=np.float64)

@@ -15,7 +15,7 @@ the distance between two centres: exact to second order, and a matrix product fo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numba
@@ -40,7 +40,6 @@ _RADII = np.repeat(MODE_RADIUS, 3)
 _EDGE = 3.0  # standard deviations within which particles belong to a mode that spreads over its radius
 _GROWTHS = 8  # of a mode, at most
 _MEANS = 4  # fixed-point steps for a mean; poses of one mode need fewer than five
-_STILL = 1e-9  # a step of the mean, rad or metres, that none need follow
 _MODES = 4  # of one class, at most
 _LIGHT = 1e-3, 0.3  # weight, and share of the mean: a mode whose heaviest particle weighs less than both is none
 _SPARSE = 2.0  # a kernel so much wider than the prediction closes gaps that the prediction would leave
@@ -172,28 +171,43 @@ def _steps(T_before: Array, T: Array, spread: Spread, shape: Shape) -> tuple[Arr
 def _log_sums(a, b, log_weight, images, out):
     """log of the sum over rows k of a (M, D) and over each query's images of exp(log_weight_k - |b - a_k|^2 / 2).
 
-    `b` is (K images, D), the images of a query next to each other; `out` is (K,).
+    `b` is (K images, D), D a multiple of three, the images of a query next to each other; `out` is (K,).
     """
-    columns, exponents = np.ascontiguousarray(a.T), np.empty(images * len(a))
+    n, columns = len(a), np.ascontiguousarray(a.T)
+    exponents = np.empty(images * n)
     for query in range(len(out)):
         for i in range(images):
-            # a feature at a time for all rows, which is vectorised
-            squared = exponents[i * len(a) : (i + 1) * len(a)]
+            # three features at a time for all rows, which is vectorised
+            squared, row = exponents[i * n : (i + 1) * n], query * images + i
             squared[:] = 0.0
-            for d in range(len(columns)):
-                at, column = b[query * images + i, d], columns[d]
-                for k in range(len(a)):
-                    squared[k] += (at - column[k]) ** 2
-            for k in range(len(a)):
+            for d in range(0, len(columns), 3):
+                x, y, z = b[row, d], b[row, d + 1], b[row, d + 2]
+                xs, ys, zs = columns[d], columns[d + 1], columns[d + 2]
+                for k in range(n):
+                    squared[k] = squared[k] + (x - xs[k]) ** 2 + (y - ys[k]) ** 2 + (z - zs[k]) ** 2
+            for k in range(n):
                 squared[k] = log_weight[k] - 0.5 * squared[k]
-        largest = -np.inf
-        for exponent in exponents:
-            largest = max(largest, exponent)
+        largest = _largest(exponents)
         total, least = 0.0, largest - _NOTHING
         for exponent in exponents:
             if exponent > least:
                 total += math.exp(exponent - largest)
         out[query] = largest + math.log(total) if total > 0.0 else -np.inf
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _largest(values):
+    """Of values (n,), by four at a time: each comparison waits for the one before."""
+    a = b = c = d = -np.inf
+    whole = len(values) // 4 * 4
+    for k in range(0, whole, 4):
+        a = values[k] if values[k] > a else a
+        b = values[k + 1] if values[k + 1] > b else b
+        c = values[k + 2] if values[k + 2] > c else c
+        d = values[k + 3] if values[k + 3] > d else d
+    for k in range(whole, len(values)):
+        a = values[k] if values[k] > a else a
+    return max(a, b, c, d)
 
 
 def _features(T: Array, shape: Shape, spread: Spread) -> Array:
@@ -220,7 +234,13 @@ def _spin(T: Array, shape: Shape, rng: np.random.Generator) -> Array:
     return T @ se3.make(se3.so3_exp(angle * shape.symmetry.axes[0]), np.zeros(3))
 
 
-def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Generator) -> Particles:
+def filled(
+    particles: Particles,
+    spread: Spread,
+    shape: Shape,
+    rng: np.random.Generator,
+    modes: Iterable[Cluster] | None = None,
+) -> Particles:
     """The same belief with what lies between its particles: equally weighted poses, drawn from a kernel density.
 
     What no view tells apart is believed to be anywhere along a line of poses, and few weighted particles on it leave
@@ -235,10 +255,11 @@ def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Ge
         spread: of the prediction that follows.
         shape: their class.
         rng: draws them.
+        modes: `clusters` of the particles, where they are known already.
     """
     walk = np.repeat([spread.rotation_rad, spread.translation_m], 3)
     sparse = []
-    for mode in _modes(particles, shape, _MODES):
+    for mode in clusters(particles, shape) if modes is None else modes:
         share = np.exp(particles.log_weight[mode.rows])
         effective = float(share.sum() ** 2 / (share**2).sum())
         width = (effective * (_DIMENSIONS + 2) / 4.0) ** (-1.0 / (_DIMENSIONS + 4))
@@ -260,7 +281,7 @@ def filled(particles: Particles, spread: Spread, shape: Shape, rng: np.random.Ge
     return Particles(T, np.full(n, -np.log(n)))
 
 
-def sufficient(particles: Particles, most: int, shape: Shape) -> int:
+def sufficient(particles: Particles, most: int, shape: Shape, modes: Iterable[Cluster] | None = None) -> int:
     """How many particles a belief needs: as many as tell its histogram over cells (Fox, KLD-sampling, IJRR 2003).
 
     Cells are counted about the heaviest particle, so that what lies close together is in one.
@@ -273,8 +294,10 @@ def sufficient(particles: Particles, most: int, shape: Shape) -> int:
         particles: weighted.
         most: the answer at most, but for what stretches.
         shape: their class.
+        modes: `clusters` of the particles, where they are known already.
     """
-    if any(stretches(mode.covariance, shape) for mode in _modes(particles, shape, 1)):
+    heaviest = next(iter(clusters(particles, shape) if modes is None else modes), None)
+    if heaviest is not None and stretches(heaviest.covariance, shape):
         return _STRETCHED * most
     rows = np.unique(systematic(particles.log_weight, most, 0.5))
     away = symmetry.residual(particles.heaviest, particles.T_world_centre[rows], shape.symmetry)
@@ -326,7 +349,7 @@ def kld_bound(cells: int) -> int:
 
 
 @dataclass(frozen=True)
-class _Mode:
+class Cluster:
     """Particles that belong together."""
 
     rows: NDArray[np.bool_]
@@ -337,7 +360,7 @@ class _Mode:
     """(6, 6) of its right tangent"""
 
 
-def _modes(particles: Particles, shape: Shape, most: int) -> Iterator[_Mode]:
+def clusters(particles: Particles, shape: Shape) -> Iterator[Cluster]:
     """The mode of the heaviest particle, then of the heaviest one left, as long as they weigh anything.
 
     A mode is what lies within `MODE_RADIUS` of its heaviest particle. It grows along directions in which its particles
@@ -345,49 +368,31 @@ def _modes(particles: Particles, shape: Shape, most: int) -> Iterator[_Mode]:
     """
     left, poses, S = particles.log_weight.copy(), particles.T_world_centre, shape.symmetry
     least = np.log(min(_LIGHT[0], _LIGHT[1] / len(left)))
-    for _ in range(most):
+    for _ in range(_MODES):
         heaviest = int(np.argmax(left))
         if left[heaviest] < least:
             return
         free = np.isfinite(left)
-        r = symmetry.residual(poses[heaviest], poses, S)
-        rows = free & (np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0])
+        T = poses[heaviest]
+        r = np.full((len(poses), 6), np.inf)
+        r[free] = symmetry.residual(T, poses[free], S)
+        rows = np.linalg.norm(r[:, :3], axis=-1) < MODE_RADIUS[0]
         rows &= np.linalg.norm(r[:, 3:], axis=-1) < MODE_RADIUS[1]
         rows[heaviest] = True
-        T, covariance = _moments(poses[heaviest], poses[rows], r[rows], left[rows], S)
-        for _ in range(_GROWTHS):
+        for growth in range(_GROWTHS + 1):
+            own = r[rows]
+            T, covariance = symmetry.moments(T, poses[rows], left[rows], S, own, _MEANS)
             variances, axes = np.linalg.eigh(covariance / np.outer(_RADII, _RADII))
-            if variances[-1] <= _EDGE**-2:
+            if growth == _GROWTHS or variances[-1] <= _EDGE**-2:
                 break
-            r = symmetry.residual(T, poses, S)
-            within = ((r / _RADII @ axes) ** 2 / np.maximum(variances, _EDGE**-2)).sum(axis=-1) < _EDGE**2
-            grown = rows | (free & within)
-            if grown.sum() == rows.sum():
+            others = np.flatnonzero(free & ~rows)
+            r[rows], r[others] = own, symmetry.residual(T, poses[others], S)
+            within = ((r[others] / _RADII @ axes) ** 2 / np.maximum(variances, _EDGE**-2)).sum(axis=-1) < _EDGE**2
+            if not within.any():
                 break
-            rows = grown
-            T, covariance = _moments(T, poses[rows], r[rows], left[rows], S)
-        yield _Mode(rows, T, covariance)
+            rows[others[within]] = True
+        yield Cluster(rows, T, covariance)
         left[rows] = -np.inf
-
-
-def _moments(T: Array, poses: Array, r: Array, log_weight: Array, S: symmetry.Symmetry) -> tuple[Array, Array]:
-    """Mean (4, 4) and covariance (6, 6) of weighted poses (n, 4, 4), each taken in its image nearest to the mean.
-
-    Args:
-        T: (4, 4) where the mean is looked for.
-        poses: (n, 4, 4).
-        r: (n, 6) their residuals from there.
-        log_weight: (n,) of any scale.
-        S: the symmetries.
-    """
-    weights = np.exp(mixture.normalised(log_weight))
-    for _ in range(_MEANS):
-        step = weights @ r
-        T = retract(T, step)
-        r = symmetry.residual(T, poses, S)
-        if np.abs(step).max() < _STILL:
-            break
-    return T, (weights[:, None] * r).T @ r
 
 
 def modes_of(c: int, particles: Particles, shape: Shape) -> list[tuple[int, float, Array, Array, Array]]:
@@ -398,7 +403,7 @@ def modes_of(c: int, particles: Particles, shape: Shape) -> list[tuple[int, floa
     """
     out: list[tuple[int, float, Array, Array, Array]] = []
     free = shape.symmetry.free_axes
-    for mode in _modes(particles, shape, _MODES):
+    for mode in clusters(particles, shape):
         # no sample variance below a tenth of a millimetre is believed, and a free direction has the circle's
         covariance = mode.covariance + 1e-8 * np.eye(6) + np.pi**2 * free @ free.T
         weight = float(mixture.log_sum(particles.log_weight[mode.rows]))

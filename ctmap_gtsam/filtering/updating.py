@@ -17,6 +17,7 @@ from ctmap_gtsam.filtering.particles import (
     Particles,
     Spread,
     Transition,
+    clusters,
     filled,
     first_count,
     predict,
@@ -438,9 +439,11 @@ class Updater:
         prior = None if own is None else own.particles
         # what is hardly possible isn't worth it
         if own is not None and change is not None and count > settings.min_particles:
-            prior = filled(own.particles, change.spread, shape, rng)
+            modes = tuple(clusters(own.particles, shape))
+            prior = filled(own.particles, change.spread, shape, rng, modes)
             # what may have been moved may be anywhere
-            count = count if np.isfinite(change.log_moved) else sufficient(prior, count, shape)
+            if not np.isfinite(change.log_moved):
+                count = sufficient(prior, count, shape, modes if prior is own.particles else None)
         elif proposals is not None and own is None and count > settings.min_particles:
             count = first_count(proposals, count, shape)
         n_proposed = round(share * count)

@@ -134,4 +134,4 @@ def _yaws(R_camera_level: Array, R_level_centre: Array, shape: Shape, planes: tu
 
 def _turns(yaw: Array) -> Array:
     """(n, 3, 3) about z."""
-    return se3.exp(np.stack([*[np.zeros_like(yaw)] * 2, yaw, *[np.zeros_like(yaw)] * 3], axis=-1))[:, :3, :3]
+    return se3.so3_exp(yaw[:, None] * np.array([0.0, 0.0, 1.0]))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,12 +146,13 @@ class Surroundings:
     def _penetration(self, model: Model, shape: Shape, T: Array, apart: Array) -> Array:
         settings = model.config.context
         total = np.zeros(len(T))
-        for other, away in zip(self.neighbours, apart, strict=True):
-            near = np.flatnonzero(away < shape.reach_m + other.shape.reach_m)
-            if len(near):
-                depth = penetration_depth(shape, other.shape, se3.inverse(T[near]) @ other.T_world_centre)
-                sinking = hinge_log_potential(depth - settings.support_tolerance_m, settings.penetration_sigma_m)
-                total[near] += doubted(sinking, settings.doubt)
+        reach = np.array([[shape.reach_m + other.shape.reach_m] for other in self.neighbours]).reshape(-1, 1)
+        touching = apart < reach
+        for n in np.flatnonzero(touching.any(axis=1)):
+            other, near = self.neighbours[n], touching[n]
+            depth = penetration_depth(shape, other.shape, se3.inverse(T[near]) @ other.T_world_centre)
+            sinking = hinge_log_potential(depth - settings.support_tolerance_m, settings.penetration_sigma_m)
+            total[near] += doubted(sinking, settings.doubt)
         return total
 
 
@@ -186,29 +189,75 @@ def support_log_potential(model: Model, shape: Shape, T_world_centre: Array, sup
     are solid. A thing wholly beneath a surface has nothing to do with it, and a table doesn't stand on its own top.
     """
     settings = model.config.context
-    best = np.full(len(T_world_centre), -np.inf)
-    for plane in supports:
-        above = plane.contains(T_world_centre[:, :3, 3])
-        if not above.any():
-            continue
-        # the normal in the shape's own axes: heights of all its points without moving them
-        along = plane.normal @ T_world_centre[:, :3, :3]
-        heights = along @ shape.hull_points.T + (T_world_centre[:, :3, 3] @ plane.normal - plane.offset)[:, None]
-        low, high = heights.min(axis=-1), heights.max(axis=-1)
+    low, high = heights_above(supports, shape, T_world_centre)
+    concerned = high > 0.0
+    for row, plane in zip(concerned, supports, strict=True):
+        if row.any():
+            row &= ~_own_surface(shape, T_world_centre, plane)
+    best = np.zeros(len(T_world_centre))
+    stands = concerned.any(axis=0)
+    if stands.any():
         floating = hinge_log_potential(low - settings.support_tolerance_m, settings.support_sigma_m)
         sinking = hinge_log_potential(-low - settings.support_tolerance_m, settings.penetration_sigma_m)
         potential = doubted(floating, settings.other_support) + doubted(sinking, settings.doubt)
-        concerned = above & (high > 0.0) & ~_own_surface(shape, T_world_centre, plane)
-        best = np.where(concerned, np.maximum(best, potential), best)
-    return np.where(np.isneginf(best), 0.0, best)
+        best[stands] = np.where(concerned, potential, -np.inf).max(axis=0)[stands]
+    return best
+
+
+def heights_above(planes: tuple[Plane, ...], shape: Shape, T_world_centre: Array) -> tuple[Array, Array]:
+    """Heights of a shape's lowest and highest points above P planes at poses (K, 4, 4): twice (P, K), metres.
+
+    -inf where the foot of its centre is outside of the plane's outline, as `Plane.contains` has it.
+    """
+    poses = np.ascontiguousarray(T_world_centre, dtype=np.float64)
+    low, high = np.full((2, len(planes), len(poses)), -np.inf)
+    for p, plane in enumerate(planes):
+        there = plane.normal, plane.offset, plane.T_frame_plane, plane.hull
+        _heights_above(poses, shape.hull_points, *there, low[p], high[p])
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _heights_above(poses, points, normal, offset, T_world_plane, outline, low, high):
+    """Least and greatest height of points (H, 3) above a plane, into (K,), at poses with their feet in its outline."""
+    low_x, high_x, low_y, high_y = outline[:, 0].min(), outline[:, 0].max(), outline[:, 1].min(), outline[:, 1].max()
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    for k in range(len(poses)):
+        dx = poses[k, 0, 3] - T_world_plane[0, 3]
+        dy = poses[k, 1, 3] - T_world_plane[1, 3]
+        dz = poses[k, 2, 3] - T_world_plane[2, 3]
+        x = T_world_plane[0, 0] * dx + T_world_plane[1, 0] * dy + T_world_plane[2, 0] * dz
+        y = T_world_plane[0, 1] * dx + T_world_plane[1, 1] * dy + T_world_plane[2, 1] * dz
+        if not (low_x <= x <= high_x and low_y <= y <= high_y):
+            continue
+        left, right = True, True
+        for i in range(len(outline)):
+            j = i + 1 if i + 1 < len(outline) else 0
+            side = (outline[j, 0] - outline[i, 0]) * (y - outline[i, 1])
+            side -= (outline[j, 1] - outline[i, 1]) * (x - outline[i, 0])
+            left &= side >= 0.0
+            right &= side <= 0.0
+        if not (left or right):
+            continue
+        # the normal in the shape's own axes: heights of all its points without moving them
+        a = nx * poses[k, 0, 0] + ny * poses[k, 1, 0] + nz * poses[k, 2, 0]
+        b = nx * poses[k, 0, 1] + ny * poses[k, 1, 1] + nz * poses[k, 2, 1]
+        c = nx * poses[k, 0, 2] + ny * poses[k, 1, 2] + nz * poses[k, 2, 2]
+        least, greatest = np.inf, -np.inf
+        for h in range(len(points)):
+            height = a * points[h, 0] + b * points[h, 1] + c * points[h, 2]
+            least = height if height < least else least
+            greatest = height if height > greatest else greatest
+        centre = nx * poses[k, 0, 3] + ny * poses[k, 1, 3] + nz * poses[k, 2, 3] - offset
+        low[k], high[k] = least + centre, greatest + centre
 
 
 def _own_surface(shape: Shape, T_world_centre: Array, plane: Plane) -> NDArray[np.bool_]:
     """Whether a surface is part of a shape at poses (K, 4, 4): (K,)."""
     own = np.zeros(len(T_world_centre), dtype=np.bool_)
-    middle = plane.hull.mean(axis=0)
-    if np.linalg.norm(plane.hull - middle, axis=-1).max() > 2.0 * shape.reach_m:
+    if _radius(plane.hull) > 2.0 * shape.reach_m:
         return own
+    middle = plane.hull.mean(axis=0)
     # halfway in: the outline reaches beyond what was measured
     flat = np.concatenate([middle[None], 0.5 * (middle + plane.hull)])
     points = se3.transform(plane.T_frame_plane, np.concatenate([flat, np.zeros((len(flat), 1))], axis=-1))
@@ -216,3 +265,15 @@ def _own_surface(shape: Shape, T_world_centre: Array, plane: Plane) -> NDArray[n
     inside = se3.transform(se3.inverse(T_world_centre[near]), points)
     own[near] = np.median(np.abs(shape.distance.at(inside)), axis=-1) < _OWN_M
     return own
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _radius(points):
+    """Greatest distance of points (n, 2) from their mean."""
+    x, y, farthest = 0.0, 0.0, 0.0
+    for i in range(len(points)):
+        x, y = x + points[i, 0], y + points[i, 1]
+    x, y = x / len(points), y / len(points)
+    for i in range(len(points)):
+        farthest = max(farthest, (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2)
+    return math.sqrt(farthest)

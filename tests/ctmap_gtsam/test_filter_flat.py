@@ -11,6 +11,7 @@ from ctmap_gtsam.filtering.filter import filter_run
 from ctmap_gtsam.filtering.particles import (
     Particles,
     Spread,
+    clusters,
     filled,
     modes_of,
     predicted_log_density,
@@ -138,6 +139,19 @@ def test_a_belief_that_stretches_over_cells_has_four_times_the_particles_and_a_s
     even = np.full(300, -np.log(300.0))
     assert sufficient(Particles(line(rng, np.eye(4), 300), even), 300, MUG) == 1200
     assert sufficient(Particles(line(rng, np.eye(4), 300, length=0.05), even), 300, MUG) == 100
+
+
+@pytest.mark.parametrize("length", [0.05, 0.3, 1.0])
+@each_shape
+def test_modes_that_are_known_already_change_nothing(shape, length):
+    rng = np.random.default_rng(5)
+    poses = np.concatenate([line(rng, se3.exp(rng.normal(size=6)), 25, length) for _ in range(2)])
+    particles = Particles(poses, mixture.normalised(rng.normal(size=50)))
+    modes = tuple(clusters(particles, shape))
+    spread, seeds = Spread(0.005, 0.001), (np.random.default_rng(6), np.random.default_rng(6))
+    alone, known = filled(particles, spread, shape, seeds[0]), filled(particles, spread, shape, seeds[1], modes)
+    np.testing.assert_array_equal(alone.T_world_centre, known.T_world_centre)
+    assert sufficient(particles, 300, shape) == sufficient(particles, 300, shape, modes)
 
 
 @pytest.mark.parametrize("n", [300, 1200])

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from ctmap_gtsam.frontend.observation import Observation, reaches_beyond, where_in_image
 from ctmap_gtsam.frontend.place import Place, describe
 from ctmap_gtsam.frontend.proposer import Proposer
-from ctmap_gtsam.frontend.surroundings import Neighbour, Surroundings, penetration_depth, support_log_potential
+from ctmap_gtsam.frontend.surroundings import (
+    Neighbour,
+    Surroundings,
+    heights_above,
+    penetration_depth,
+    support_log_potential,
+)
 from ctmap_gtsam.frontend.visibility import outlook
 from sequences import se3
 from sequences.geometry import Plane, PlaneSearch
@@ -170,6 +176,25 @@ def test_a_thing_of_the_same_kind_nearby_is_welcome_and_a_stranger_is_nothing():
     assert said[0] > 0.1
     assert said[1] == pytest.approx(0.0, abs=1e-9)
     assert said[0] > far
+
+
+@given(st.integers(0, 2**31))
+def test_heights_above_surfaces_are_those_of_the_points_where_an_outline_holds_the_centre(seed):
+    rng = np.random.default_rng(seed)
+    outline = np.sort(rng.uniform(0.0, 2.0 * np.pi, 9))[:: rng.choice([-1, 1]), None]
+    outline = np.concatenate([np.cos(outline), np.sin(outline)], axis=-1) * rng.uniform(0.05, 0.5, 2)
+    planes = tuple(
+        replace(surface(0.0), hull=outline).moved(se3.exp(rng.normal(size=6) * np.repeat([3.0, 0.1], 3)))
+        for _ in range(3)
+    )
+    poses = se3.exp(rng.normal(size=(20, 6)) * np.repeat([2.0, 0.2], 3))
+    low, high = heights_above(planes, MUG, poses)
+    for p, plane in enumerate(planes):
+        heights = se3.transform(poses, MUG.hull_points) @ plane.normal - plane.offset
+        within = plane.contains(poses[:, :3, 3])
+        np.testing.assert_array_equal(np.isneginf(low[p]), ~within)
+        np.testing.assert_allclose(low[p][within], heights[within].min(axis=-1), rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(high[p][within], heights[within].max(axis=-1), rtol=0.0, atol=1e-12)
 
 
 def height_potential(height, supports):

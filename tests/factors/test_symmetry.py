@@ -137,6 +137,26 @@ def test_the_nearest_image_looks_the_same_and_is_near(seed):
     assert min(np.abs(image - T_b @ g).max() for g in symmetry.discrete) < 1e-12
 
 
+@given(SEEDS)
+@settings(max_examples=20)
+@each_symmetry
+def test_moments_are_those_of_the_nearest_images(symmetry, seed):
+    rng = np.random.default_rng(seed)
+    start = random_pose(rng)
+    poses = se3.retract(start, rng.normal(size=(30, 6)) * np.repeat([0.1, 0.02], 3))
+    poses = np.stack([T @ random_image(rng, symmetry) for T in poses])
+    log_weights = rng.normal(size=30)
+    r = sym.residual(start, poses, symmetry)
+    mean, covariance = sym.moments(start, poses, log_weights, symmetry, r, 10)
+    expected, weights = start, np.exp(log_weights) / np.exp(log_weights).sum()
+    for _ in range(10):
+        expected = se3.retract(expected, weights @ sym.residual(expected, poses, symmetry))
+    away = sym.residual(expected, poses, symmetry)
+    np.testing.assert_allclose(mean, expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(r, away, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(covariance, (weights[:, None] * away).T @ away, rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["axis", "ball"])
 def test_the_gauge_holds_what_the_residual_leaves_free(name):
     symmetry = SYMMETRIES[name]
