@@ -61,7 +61,7 @@ class Detector:
         high=0.9,
     )
     lookalike: float = option(
-        0.1, "odds that what a known mesh explains is something else of its shape", low=1e-9, high=1e3
+        0.1, "chance that what a known mesh explains is something else of its shape", low=1e-9, high=0.5
     )
     deceived: float = option(
         0.2,
