@@ -127,7 +127,7 @@ class Frontend:
     """Tracks and proposals, shared by filter and smoother."""
 
     association_iou: float = option(0.4, "least overlap of a box with its track's predicted box", low=0.0, high=1.0)
-    start_after: int = option(3, "frames with a box before a track is estimated", low=1)
+    start_after: int = option(2, "frames with a box before a track is estimated", low=1)
     lost_after_s: float = option(2.0, "a track not yet started is given up after so long without a box, s", low=0.0)
     angular_step_rad: float = option(0.0075, "depth is sampled at this step", low=1e-4)
     tile_samples: int = option(6400, "at most so many in a region: what is larger is sampled more coarsely", low=64)
