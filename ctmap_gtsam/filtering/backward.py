@@ -273,19 +273,8 @@ def leaving(stages: Sequence[Stage], until_ns: int | None, model: Model) -> Arra
     times = [stage.time_ns for stage in stages] + ([] if until_ns is None else [until_ns])
     out = np.full((len(stages), len(model.shapes)), -np.inf)
     for j, (earlier, later) in enumerate(pairwise(times)):
-        out[j] = stages[j].log_evidence + _log_leave(model, (later - earlier) * 1e-9)
+        out[j] = stages[j].log_evidence + model.log_leave((later - earlier) * 1e-9)
     return out
-
-
-def _log_leave(model: Model, dt_s: float) -> Array:
-    """(C,) log probability of being taken away between two keyframes: Equation 3 in absences, else a push."""
-    settings = model.config.prediction
-    if dt_s < settings.significant_period_s:
-        left = [settings.jump_probability if s.source.movable else 0.0 for s in model.shapes]
-    else:
-        left = [1.0 - model.stay_probability(s.source, dt_s) for s in model.shapes]
-    with np.errstate(divide="ignore"):
-        return np.log(np.array(left))
 
 
 def last_there(end: Array, left: Array, stages: Sequence[Stage], model: Model) -> Array:

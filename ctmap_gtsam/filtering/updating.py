@@ -256,32 +256,24 @@ class Updater:
         return camera if own is None else camera - own.particles.heaviest[:3, 3]
 
     def _allow_move(self, belief: Belief, observation: Observation) -> Belief:
-        """After a significant absence the object stayed with S(dt) (Equation 3), or was moved.
+        """It stayed, or was taken away: after a significant absence with 1 - S(dt) (Equation 3), in view now and then.
 
-        What was moved is where nobody has looked, or else a pose of this view, see `_weigh`.
+        What was taken away is where nobody has looked, or else, after an absence, a pose of this view, see `_weigh`.
         """
         gap = (observation.frame.time_ns - belief.time_ns) * 1e-9
-        settings = self.model.config.prediction
-        if gap < settings.significant_period_s:
-            return belief
-        total = belief.class_log_evidence(self.model)
-        stay = np.array([self.model.stay_probability(s.source, gap) for s in self.model.shapes])
-        with np.errstate(divide="ignore"):
-            left, log_stay = float(log_sum(total + np.log1p(-stay))), np.log(stay)
+        log_leave = self.model.log_leave(gap)
+        log_stay = np.log1p(-np.exp(log_leave))
+        left = float(log_sum(belief.class_log_evidence(self.model) + log_leave))
         classes = tuple(
             None if own is None else replace(own, log_evidence=own.log_evidence + float(log_stay[c]))
             for c, own in enumerate(belief.classes)
         )
-        with np.errstate(divide="ignore"):
-            log_odds = np.log1p(-stay) - log_stay
+        taken = replace(belief, classes=classes, log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)))
+        if gap < self.model.config.prediction.significant_period_s:
+            return taken
         poses = tuple(None if own is None else own.particles for own in belief.classes)
-        return replace(
-            belief,
-            classes=classes,
-            log_elsewhere=float(np.logaddexp(belief.log_elsewhere, left)),
-            absence=Absence(poses, log_odds, belief.time_ns, observation.frame.time_ns),
-            returned=belief.steps,
-        )
+        absence = Absence(poses, log_leave - log_stay, belief.time_ns, observation.frame.time_ns)
+        return replace(taken, absence=absence, returned=belief.steps)
 
     def _moved_odds(self, belief: Belief, shape: Shape, observation: Observation) -> float:
         """log of P(moved) / P(stayed) of a class, in the keyframe that ends an absence; else -inf."""
@@ -464,8 +456,10 @@ class Updater:
                 landed = landing_log_density(self.model, shape, T, change.supports)
                 elsewhere = np.logaddexp(elsewhere, change.log_moved + landed)
             log_drawn = np.logaddexp(stayed, elsewhere)
-            # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere
-            seen = (view.detection is not None) | (scores.visible > _IN_SIGHT * scores.covered)
+            # what jumps nearby is seen there: to have got out of sight is to have been moved elsewhere, and where it
+            # is seen through it isn't
+            in_sight = (scores.visible > _IN_SIGHT * scores.covered) & (scores.log_ratio > 0.0)
+            seen = (view.detection is not None) | in_sight
             log_prior = np.where(seen, log_drawn, stayed)
             transition = Transition(change.spread, np.where(seen, elsewhere, -np.inf))
             # the prediction's tails end somewhere, or thousands of nats of depth buy any distance
