@@ -16,7 +16,7 @@ from sequences import se3
 from sequences.types import Detection
 from tests.ctmap_gtsam.scenes import CAMERA, classes, depth_of, frame_of, looking, run_of
 
-SETTINGS = Frontend()
+SETTINGS = Frontend(start_after=3)
 CATALOGUE = classes("mug", "banana")
 SPOTS = np.array([[0.0, 0.0, 0.0], [0.2, 0.05, 0.0], [-0.2, 0.1, 0.0]])  # on the table, world, metres
 SIZE_M = 0.08
