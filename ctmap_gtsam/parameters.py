@@ -86,7 +86,7 @@ class Prediction:
     rotation_rate: float = option(0.01, "random walk in view, rad per sqrt(s)", low=1e-6)
     translation_rate: float = option(0.002, "random walk in view, metres per sqrt(s)", low=1e-6)
     jump_probability: float = option(
-        1e-4, "chance a keyframe that a seen pose is elsewhere nearby", low=1e-15, high=0.5
+        1e-4, "chance a keyframe that a seen thing is pushed elsewhere nearby, or taken away", low=1e-15, high=0.5
     )
     region_radius_m: float = option(
         0.3, "radius of that neighbourhood, and of where a first pose may be, metres", low=0.01
