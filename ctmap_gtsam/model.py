@@ -89,11 +89,14 @@ class Model:
         r1 = self.config.prediction.stay_limit
         return float(stay_probability(away_s, known.persistence_s, r1, 1.0 - r1)) if known.movable else 1.0
 
+    def jump_probability(self, known: ObjectClass) -> float:
+        """The chance of a push from one keyframe to the next; nobody pushes a cupboard."""
+        return self.config.prediction.jump_probability if known.movable else 0.0
+
     def log_leave(self, dt_s: float) -> Array:
         """(C,) log probability of being taken away between two keyframes: Equation 3 in absences, else as a push."""
-        p = self.config.prediction
-        if dt_s < p.significant_period_s:
-            left = [p.jump_probability if s.source.movable else 0.0 for s in self.shapes]
+        if dt_s < self.config.prediction.significant_period_s:
+            left = [self.jump_probability(s.source) for s in self.shapes]
         else:
             left = [1.0 - self.stay_probability(s.source, dt_s) for s in self.shapes]
         with np.errstate(divide="ignore"):

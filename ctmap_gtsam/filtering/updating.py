@@ -448,8 +448,8 @@ class Updater:
         log_prior = log_drawn = np.full(len(T), log_uniform)
         transition = None
         if own is not None and prior is not None and change is not None:
-            # nobody pushes a cupboard; if it seems to be elsewhere it was never found, which a search can mend
-            jump = self.model.config.prediction.jump_probability if shape.source.movable else 0.0
+            # if what can't be moved seems to be elsewhere it was never found, which a search can mend
+            jump = self.model.jump_probability(shape.source)
             stayed = np.log1p(-jump) + predicted_log_density(prior, T, change.spread, shape)
             elsewhere = np.full(len(T), np.log(jump) + log_uniform if jump > 0.0 else -np.inf)
             if np.isfinite(change.log_moved):
